@@ -193,6 +193,11 @@ def owner_only(path: str, flags: int) -> int:
     return os.open(path, flags, _OWNER_ONLY)
 
 
+def is_plain(name: str) -> bool:
+    """True for the path of a file below a folder, with /, which all systems read alike."""
+    return not ("\\" in name or ":" in name or {"", ".", ".."} & set(name.split("/")))
+
+
 def is_folder(path: str | os.PathLike[str]) -> bool:
     """True for a folder. Raises UsageError for a name in a folder that may not be entered."""
     return stat.S_ISDIR(_mode(path))

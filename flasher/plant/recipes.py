@@ -18,7 +18,9 @@ from flasher.image.load import FILE_MAX_SIZE
 from flasher.plant.central import Central
 from flasher.plant.schema import plant_station, recipe_event, released_file, released_recipe
 from flasher.protocol.text import printable
-from flasher.station.given_recipes import FILES_MAX, Bundle, RecipeFolder, bundle_of
+from flasher.settings.manifest import manifest_path
+from flasher.station.given_recipes import Bundle, RecipeFolder, bundle_of, parse_bundle
+from flasher.station.recipe import Recipe
 from flasher.station.recipe_file import LoadedRecipe
 
 PUBLISHED: Final = "published"
@@ -63,7 +65,15 @@ def publish(
     """Give a recipe to stations (none named: all) and their sockets (none named: all). Raises
     UsageError, RecordError.
     """
+    _check_links(loaded)
     bundle = bundle_of(loaded)
+    try:
+        parse_bundle(bundle.to_text(), bundle.digest)
+    except ValueError as error:
+        raise UsageError(
+            f"The recipe cannot be published: {printable(str(error))}.",
+            remedy="Name the files in its folder with letters, digits and hyphens.",
+        ) from error
     folder = loaded.path.parent
     contents = {}
     for name, sha256 in bundle.files.items():
@@ -73,6 +83,7 @@ def publish(
     facts = {"name": rule.name, "revision": rule.revision, "part": rule.part}
     with central.writing() as connection:
         _check_known(connection, stations)
+        _check_revision(connection, bundle.digest, rule)
         for sha256, data in contents.items():
             connection.execute(
                 insert(released_file).values(sha256=sha256, data=data).on_conflict_do_nothing()
@@ -93,10 +104,25 @@ def publish(
     return bundle
 
 
+def _check_links(loaded: LoadedRecipe) -> None:
+    """Check that each file of the recipe is stored by the name that the recipe uses. Raises
+    UsageError.
+    """
+    rule, folder = loaded.recipe, loaded.path.parent
+    names = [loaded.path.name, *([rule.profile] if rule.profile else [])]
+    for target in rule.target:
+        names += [target.image, target.manifest or str(manifest_path(target.image))]
+    for name in names:
+        if (folder / name).resolve() != folder.resolve() / name:
+            raise UsageError(
+                f"{printable(name)} is a link to another file.",
+                where=printable(str(loaded.path)),
+                remedy="Copy the file itself to this name, then publish the recipe.",
+            )
+
+
 def _try_out(bundle: Bundle, contents: dict[str, bytes], day: date) -> None:
     """Load the recipe from its bundle as a station will. Raises UsageError."""
-    if len(bundle.files) > FILES_MAX:
-        raise UsageError(f"The recipe has more than {FILES_MAX} files.")
     with tempfile.TemporaryDirectory(prefix="flasher-publish-") as place:
         folder = RecipeFolder(Path(place))
         try:
@@ -133,6 +159,25 @@ def events_of(central: Central) -> list[RecipeEvent]:
 
 def _events(connection: Connection) -> list[RecipeEvent]:
     return [RecipeEvent(**row) for row in connection.execute(_EVENTS).mappings()]
+
+
+def _check_revision(connection: Connection, digest: str, rule: Recipe) -> None:
+    """Check that records which name this revision mean one content. Raises UsageError."""
+    known = released_recipe.c
+    query = select(known.digest).where(
+        known.name == rule.name,
+        known.part == rule.part,
+        known.revision == rule.revision,
+        known.digest != digest,
+    )
+    if other := connection.execute(query.limit(1)).scalar():
+        raise UsageError(
+            printable(
+                f"{rule.name}, revision {rule.revision}, was published with other content:"
+                f" {other[:16]}."
+            ),
+            remedy="Change the revision in the recipe, then publish it.",
+        )
 
 
 def _check_known(connection: Connection, stations: Sequence[str]) -> None:

@@ -10,7 +10,7 @@ import io
 import os
 import zipfile
 from collections.abc import Mapping
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Final
 
 from cryptography.exceptions import InvalidTag
@@ -18,7 +18,7 @@ from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 from cryptography.hazmat.primitives.kdf.scrypt import Scrypt
 
 from flasher.errors import ErrorCode, UsageError
-from flasher.files import read
+from flasher.files import is_plain, read
 from flasher.protocol.text import printable
 from flasher.station.records.errors import UnprovenError, mapped
 from flasher.station.records.files import whole_file
@@ -82,15 +82,10 @@ def unseal(path: Path, passphrase: str) -> dict[str, bytes]:
             remedy=f"Enter the passphrase again. {_REMEDY}",
         ) from error
     with zipfile.ZipFile(io.BytesIO(packed)) as archive:
-        return {name: archive.read(name) for name in archive.namelist() if _is_inside(name)}
+        return {name: archive.read(name) for name in archive.namelist() if is_plain(name)}
 
 
 def _cipher(head: bytes, passphrase: str) -> tuple[AESGCM, bytes]:
     salt = head[len(_MAGIC) : len(_MAGIC) + _SALT_SIZE]
     made = Scrypt(salt=salt, length=32, n=_SCRYPT_N, r=8, p=1).derive(passphrase.encode())
     return AESGCM(made), head[len(_MAGIC) + _SALT_SIZE :]
-
-
-def _is_inside(name: str) -> bool:
-    path = PurePosixPath(name)
-    return not (path.is_absolute() or ".." in path.parts or "\\" in name or ":" in name)

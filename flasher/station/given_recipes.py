@@ -23,10 +23,10 @@ from typing import Final
 from pydantic import TypeAdapter, ValidationError
 
 from flasher.errors import ErrorCode, FlasherError, UsageError
-from flasher.files import read
+from flasher.files import is_plain, read
 from flasher.i18n import text
 from flasher.protocol.text import printable
-from flasher.station.recipe_file import LoadedRecipe, inside, load_checked, sha256_of
+from flasher.station.recipe_file import LoadedRecipe, load_checked, sha256_of
 from flasher.station.records.chain import canonical
 from flasher.station.records.database import in_file_name
 from flasher.station.records.errors import RecordError, mapped
@@ -92,9 +92,8 @@ def parse_bundle(manifest: str, digest: str) -> Bundle:
     if len({name.casefold() for name in names}) != len(names):
         raise ValueError("two of its files have the same name")
     for name in names:
-        if "\\" in name or any(each in ("", ".", "..") for each in name.split("/")):
-            raise ValueError(f"{name!a:.80} is no name of a file in it")
-        inside(Path(os.sep) / "bundle" / bundle.recipe, name)
+        if not is_plain(name):
+            raise ValueError(f"{name!a:.80} is no plain name of a file in its folder")
     return bundle
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import os
 import random
 from collections.abc import Iterator
 from contextlib import closing
@@ -22,11 +23,12 @@ from flasher.plant.recipes import events_of, publish, withdraw
 from flasher.plant.release_functions import PIECE_BYTES
 from flasher.plant.setup import PUBLISHERS, setup
 from flasher.station.given_recipes import Bundle, RecipeFolder, bundle_of
+from flasher.station.recipe_file import load_checked
 from flasher.station.records.errors import RecordError
 from flasher.station.records.model import AuditEvent
 from tests.plant.factory import PASSWORD, STATIONS, Plant, Sender
 from tests.plant.old_databases import make_old
-from tests.station.factory import DAY, USUAL, make_recipe
+from tests.station.factory import DAY, USUAL, make_recipe, write_recipe
 
 PUBLISHER = "flasher_anna"
 REVISION_5 = USUAL.replace('revision = "4"', 'revision = "5"')
@@ -133,6 +135,40 @@ def test_a_wrong_station_is_named_before_anything_is_stored(centre: Centre) -> N
     with pytest.raises(UsageError, match="no station line-9: there are line-2, line-3"):
         centre.publish(REVISION_5, ("line-9",))
     assert centre.plant.rows("SELECT count(*) FROM released_file") == [(0,)]
+
+
+@pytest.mark.parametrize("linked", ["recipe.toml", "bms.bin", "bms.bin.toml"])
+def test_a_link_is_named_and_not_published(centre: Centre, linked: str) -> None:
+    write_recipe(centre.source, REVISION_5)
+    file = centre.source / linked
+    file.replace(centre.source / "elsewhere")
+    file.symlink_to("elsewhere")
+    loaded = load_checked(centre.source / "recipe.toml", DAY)
+    with pytest.raises(UsageError, match=f"{linked} is a link"):
+        publish(centre.central, loaded, (), (), DAY)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no name of a file there")
+def test_a_name_that_other_systems_read_otherwise_is_not_published(centre: Centre) -> None:
+    make_recipe(centre.source, REVISION_5)
+    for name in ("bms.bin", "bms.bin.toml"):
+        (centre.source / name).replace(centre.source / f"x\\{name}")
+    text = REVISION_5.replace('"bms.bin"', "'x\\bms.bin'")
+    (centre.source / "recipe.toml").write_text(text, encoding="utf-8")
+    loaded = load_checked(centre.source / "recipe.toml", DAY)
+    with pytest.raises(UsageError, match="cannot be published"):
+        publish(centre.central, loaded, (), (), DAY)
+
+
+def test_a_revision_is_published_with_one_content(centre: Centre) -> None:
+    digest = centre.publish(REVISION_5)
+    withdraw(centre.central, digest, "wrong limits")
+    other = REVISION_5 + "\n[lot]\nrequired = true\n"
+    with pytest.raises(UsageError, match=f"revision 5, .* other content: {digest[:16]}"):
+        centre.publish(other)
+    assert centre.publish(REVISION_5) == digest
+    centre.publish(other.replace('"5"', '"6"'))
+    assert len(events_of(centre.central)) == 4
 
 
 def test_what_the_owner_of_the_database_alters_is_not_taken(centre: Centre) -> None:
