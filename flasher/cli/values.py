@@ -103,6 +103,13 @@ def port(text: str) -> int:
     return int(text)
 
 
+def reason(text: str) -> str:
+    """Parse a reason for the records, which is not empty."""
+    if not text.strip():
+        raise click.BadParameter("must not be empty")
+    return text.strip()
+
+
 def key_value(text: str) -> tuple[str, str]:
     """Parse KEY=VALUE."""
     match = _KEY_VALUE.fullmatch(text)

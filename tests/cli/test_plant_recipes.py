@@ -132,6 +132,13 @@ def test_a_published_recipe_is_fetched_approved_and_used_from_the_next_unit_on(
     assert (approval["by"], approval["published_by"]) == ("Kim", PUBLISHER)
     (status,) = plant.status().recipes
     assert (status.socket, status.digest) == ("A", digest)
+    database = ("--database", plant.url(PUBLISHER))
+    withdrawn = flasher("plant", "withdraw", digest[:12], "--reason", "wrong limits", *database)
+    assert withdrawn.out.splitlines()[0].endswith(f"{digest[:16]}: wrong limits")
+    listed = flasher("plant", "recipes", *database).out.splitlines()
+    assert [line.split()[2:6] for line in listed] == [
+        ["UTC", "published", "by", f"{PUBLISHER}:"], ["UTC", "withdrawn", "by", f"{PUBLISHER}:"],
+    ]  # fmt: skip
 
 
 def test_the_database_is_given_the_longest_time_limit_of_the_recipes(
@@ -158,3 +165,9 @@ def test_the_database_is_given_the_longest_time_limit_of_the_recipes(
     gate.close()
     bench.store.close()
     assert limits == [9.0]
+
+
+def test_a_withdrawal_needs_a_reason(flasher: Flasher) -> None:
+    run = flasher("plant", "withdraw", "0" * 16, "--reason", " ", "--database", "postgresql://x/y")
+    assert run.code == ExitCode.USAGE
+    assert "--reason: must not be empty" in run.err

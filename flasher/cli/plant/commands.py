@@ -290,7 +290,10 @@ def publish(
 
 @plant.action("withdraw")
 @argument("digest", metavar="DIGEST", help="its digest, or the first digits")
-@option("--reason", metavar="TEXT", required=True, brief=True, help="the reason, for the records")
+@option(
+    "--reason", type=values.reason, required=True, brief=True, metavar="TEXT",
+    help="the reason, for the records",
+)  # fmt: skip
 @_database_option
 def withdraw(output: Output, digest: str, database: str, reason: str) -> int:
     """Withdraw a published recipe: stations begin no unit with it as soon as they know. To publish

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 
 from flasher.cli.output import Output
@@ -44,6 +44,10 @@ def withdraw(output: Output, digest: str, url: str, reason: str) -> int:
     with open_central(url) as central:
         event = centre.withdraw(central, digest, reason)
     output.results(_lines([event]))
+    output.result(
+        "Stations that use it begin no further unit. Publish another recipe for them, even one that"
+        " was published before: the newest publication counts."
+    )
     return output.document(PlantRecipesDocument([event]))
 
 
@@ -61,6 +65,6 @@ def _lines(events: Sequence[RecipeEvent]) -> Iterator[str]:
         where = f"{each.station or 'all stations'}, {each.socket or 'all sockets'}"
         detail = each.reason if each.what == WITHDRAWN else where
         yield printable(
-            f"{each.at:%Y-%m-%d %H:%M} {each.what} by {each.by}: {each.name}, revision"
-            f" {each.revision}, {each.digest[:16]}: {detail}"
+            f"{each.at.astimezone(UTC):%Y-%m-%d %H:%M} UTC {each.what} by {each.by}: {each.name},"
+            f" revision {each.revision}, {each.digest[:16]}: {detail}"
         )

@@ -132,7 +132,10 @@ _operator_option: Final = option(
 
 
 def _reason_option(*, required: bool) -> Decorator:
-    return option("--reason", required=required, metavar="TEXT", help="the reason, for the records")
+    return option(
+        "--reason", type=values.reason, required=required, metavar="TEXT",
+        help="the reason, for the records",
+    )  # fmt: skip
 
 
 def _share(text: str) -> float:
