@@ -390,7 +390,11 @@ class BenchController:
     def choose_bike(self) -> None:
         """Select the whole bike, and check which sets of images can be used."""
         self.choose_target("")
-        self.show(is_bike=True)
+        profiles = map(
+            self.backend.profile,
+            (each for each in TARGETS.values() if settings_of(each, self.backend.dialect)),
+        )
+        self.show(is_bike=True, keeps_settings=any(each.keep_settings for each in profiles))
         self.judge()
 
     def judge(self) -> None:
@@ -619,12 +623,12 @@ class BenchController:
                 way_back.append(found)
         return way_back
 
-    def upgrade(self, target: str, sha256: str) -> None:
-        """Upgrade with the image of this digest, as chosen when the button was pressed. Raises
-        UsageError if the page was outdated.
+    def shown_offer(self, selection: str) -> Offer:
+        """Return the selected image. Raises UsageError unless the page showed this selection when
+        its button was pressed.
         """
-        chosen, offer = self.state.target, self.state.offer
-        if chosen is None or offer is None or (chosen.name, offer.sha256) != (target, sha256):
+        offer = self.state.offer
+        if offer is None or selection != self.state.selection:
             raise UsageError(
                 "Another device or image was chosen meanwhile; nothing was sent.",
                 remedy="Check the selection, then start again.",
@@ -634,17 +638,16 @@ class BenchController:
                 "A file came meanwhile; nothing was sent.",
                 remedy="Check the selection, then start again.",
             )
+        return offer
+
+    def upgrade(self, selection: str) -> None:
+        """Upgrade the selected device (`BenchState.selection`)."""
+        offer = self.shown_offer(selection)
         self._begin()
-        job = self.job(offer.path, chosen)
+        job = self.job(offer.path, self.state.target)
         if job.plan.image.sha256 != offer.sha256:
             raise changed_error(offer)
-        self.carry_out(job, offer, self.battery_shown)
-
-    @property
-    def battery_shown(self) -> str:
-        """Serial number of the battery that the page shows; "" if it is unknown."""
-        bike = self.state.bike
-        return "" if bike is None or self.state.is_rescue else serial_number(bike.version)
+        self.carry_out(job, offer, self.state.battery)
 
     def check_same_bike(self, battery: str) -> None:
         """Raise WrongDeviceError if another battery answers than the one with this serial number;
@@ -685,7 +688,9 @@ class BenchController:
                 adapter,
                 job,
                 self.connected,
-                keeps_settings=bool(self.state.keeps_settings),
+                keeps_settings=bool(
+                    self.state.keeps_settings and settings_of(job.plan.target, self.backend.dialect)
+                ),
                 on_event=self._happened,
                 cancelled=self.cancelled,
             )
@@ -707,19 +712,24 @@ class BenchController:
             again = RESCUE if carried.error.needs_rescue else _AGAIN
             carried.error.remedy = with_value(carried.error.remedy, AGAIN, again)
         state = self.state
+        before = None if state.is_rescue else state.bike  # a bootloader does not report its unit
         done = Done(
-            self.date(), adapter, job.plan.target, offer, state.checks, state.bike, state.furthest,
+            self.date(), adapter, job.plan.target, offer, state.checks, before, state.furthest,
             carried.result, carried.error, carried.bundle, warning=carried.warning,
         )  # fmt: skip
         self.show(done=done, power_cycle_s=None, adapter_left_s=None, phase=None)
-        version = None if done.before is None else done.before.version
-        self.note_session(serial_number(version), done.offer, done.error, is_left_out=False)
         is_new = carried.result is not None and carried.result.outcome.ok
-        if is_new and done.target.has_version_query:
-            self.show(doing=Activity.LOOKING_AGAIN)
-            after = self.seen(done.target)
-            done = replace(done, after=after)
-            self.show(done=done, bike=after if done.target is BMS else state.bike)
+        serial = battery
+        try:
+            if is_new and done.target.has_version_query:
+                self.show(doing=Activity.LOOKING_AGAIN)
+                after = self.seen(done.target)
+                serial = serial or serial_number(after.version)
+                is_same = state.bike is not None and serial == serial_number(state.bike.version)
+                done = replace(done, after=after, before=state.bike if is_same else done.before)
+                self.show(done=done, bike=after if done.target is BMS else state.bike)
+        finally:  # also if the adapter is lost meanwhile
+            self.note_session(serial, offer, done.error, is_left_out=False)
         return done
 
     def note_session(

@@ -12,7 +12,7 @@ from flasher.bike import (
     look_at_bike,
     serial_number,
 )
-from flasher.errors import InterruptedByUserError, UsageError
+from flasher.errors import InterruptedByUserError
 from flasher.i18n import text, with_value
 from flasher.protocol.spec import BMS, Target
 from flasher.web.bench import RESCUE, BenchController, changed_error
@@ -21,22 +21,17 @@ from flasher.web.bench_state import Activity, Offer, SetDevice
 _GO_ON: Final = text("Go on with the bike.")
 
 
-def upgrade_bike(bench: BenchController, sha256: str) -> None:
-    """Check the whole bike, then upgrade the devices of the chosen set in a safe order; begun
-    again, it goes on where it stopped. `sha256` are the digests of its images, joined.
+def upgrade_bike(bench: BenchController, selection: str) -> None:
+    """Check the whole bike, then upgrade the devices of the selected set in a safe order; begun
+    again, it goes on where it stopped.
 
     Raises UsageError if the page was outdated, and FlasherError for what speaks against the
     upgrade; the error of an upgrade that has begun is in its `done`.
     """
-    chosen = bench.state.offer
-    if chosen is None or chosen.sha256 != sha256 or not chosen.parts or bench.has_new_files:
-        raise UsageError(
-            "Another device or image was chosen meanwhile; nothing was sent.",
-            remedy="Check the selection, then start again.",
-        )
+    chosen = bench.shown_offer(selection)
     offers = dict(chosen.parts)
     jobs = {target: job for target, (_, job) in bench.set_jobs(chosen.path).items()}
-    if "".join(job.plan.image.sha256 for job in jobs.values()) != sha256:
+    if "".join(job.plan.image.sha256 for job in jobs.values()) != chosen.sha256:
         raise changed_error(chosen)
     bench.show(doing=Activity.LOOKING, compared=None)
     profiles = {target: bench.backend.profile(target) for target in jobs}
@@ -44,7 +39,7 @@ def upgrade_bike(bench: BenchController, sha256: str) -> None:
         with bench.connected() as connection:
             dialect = bench.backend.dialect
             found = look_at_bike(connection, dialect, profiles, cancelled=bench.cancelled)
-            bench.check_same_bike(bench.battery_shown)
+            bench.check_same_bike(bench.state.battery)
             judge_bike(found, jobs, ())
             battery = serial_number(found.answers[BMS].version)
             kept = {

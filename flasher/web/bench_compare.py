@@ -39,6 +39,7 @@ def compare(bench: BenchController) -> None:
     unit = TargetWatcher(WatchedTarget(target, profile))
     bench.show(doing=Activity.COMPARING, compared=None, compared_bytes=0)
     with bench.connected() as connection:
+        bench.check_same_bike(bench.state.battery)
         device = connection.device(target, dialect=bench.backend.dialect, profile=profile)
         found, unread = compare_device(
             device, job.plan, job.options,

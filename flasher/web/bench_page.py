@@ -59,8 +59,8 @@ _ORDERS: Final[Mapping[str, tuple[Callable[..., None], tuple[str, ...]]]] = {
     "folder": (BenchController.use_folder, ("path",)),
     "image": (BenchController.choose_image, ("name",)),
     "bike": (BenchController.choose_bike, ()),
-    "upgrade-bike": (upgrade_bike, ("sha256",)),
-    "upgrade": (BenchController.upgrade, ("target", "sha256")),
+    "upgrade-bike": (upgrade_bike, ("selection",)),
+    "upgrade": (BenchController.upgrade, ("selection",)),
     "next": (BenchController.start_over, ()),
     "rescue": (partial(BenchController.start_over, is_rescue=True), ()),
     "next-bikes": (take_next_bikes, ()),
@@ -222,13 +222,13 @@ class BenchPage:
         yield {"ended": True}
 
     def _parts(self, translate: Translator, state: BenchState) -> dict[str, str]:
+        selection = state.selection
         state = as_it_is_now(state)
         return self._pages.parts(
-            translate, "bench_parts.html", state=state, targets=TARGETS.values(),
-            folder=str(self._shelf.folder), is_mock=self._is_mock, facts=facts(state),
-            left_s=left_s(state), battery_answers=battery_answers(state), waivers=WAIVERS,
-            shown_s=SHOWN_S,
-            without_options=without_options,
+            translate, "bench_parts.html", state=state, selection=selection,
+            targets=TARGETS.values(), folder=str(self._shelf.folder), is_mock=self._is_mock,
+            facts=facts(state), left_s=left_s(state), battery_answers=battery_answers(state),
+            waivers=WAIVERS, shown_s=SHOWN_S, without_options=without_options,
         )  # fmt: skip
 
     async def _order(self, request: Request) -> Response:

@@ -6,10 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from enum import Enum
+from hashlib import sha256
 from pathlib import Path
 
 from flasher import events
 from flasher.api import DeviceInfo, Result
+from flasher.bike import serial_number
 from flasher.errors import FlasherError
 from flasher.history import Flash
 from flasher.host.verify import Verdict, Verification
@@ -309,6 +311,19 @@ class BenchState:
     session: tuple[SessionEntry, ...] = ()
     trouble: FlasherError | None = None
     """Error of the last step; upgrades have theirs in `done`."""
+
+    @property
+    def battery(self) -> str:
+        """Serial number of the battery that is shown; "" if it is unknown."""
+        return "" if self.bike is None or self.is_rescue else serial_number(self.bike.version)
+
+    @property
+    def selection(self) -> str:
+        """Digest of all that an upgrade depends on, so that only what a page shows is upgraded."""
+        adapter = self.adapter and self.adapter.name
+        shown = (adapter, self.battery, self.target, self.is_rescue, self.keeps_settings)
+        offer = self.offer and (self.offer.path, self.offer.sha256, self.offer.waived)
+        return sha256(repr((shown, offer)).encode()).hexdigest()
 
     @property
     def is_idle(self) -> bool:

@@ -173,7 +173,7 @@ class _SeriesRun:
         bench.show(offer=offer)
         self._show(SeriesStep.UPGRADING, serial=serial)
         try:
-            bench.upgrade(self._target.name, offer.sha256)
+            bench.upgrade(bench.state.selection)
         finally:  # also if the adapter is lost while the unit is read after its upgrade
             done = bench.state.done
             if done is not None:

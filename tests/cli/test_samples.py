@@ -140,7 +140,7 @@ def test_the_bench_page_neither_offers_nor_sends_one(
     assert offer.refusal is None, "a virtual bike takes it"
     done = place.do(
         order(BenchController.choose_image, offer.name),
-        order(BenchController.upgrade, "bms", offer.sha256),
+        lambda bench: bench.upgrade(bench.state.selection),
     ).done
     assert done is not None
     assert done.error is not None

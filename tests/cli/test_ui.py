@@ -65,10 +65,10 @@ class _Browser:
         self.order("target", name="bms")
         self.until("image", "image-1")
         self.order("image", name=IMAGE)
-        self.until("start", "sha256")
-        found = re.search(r'name="sha256" value="([0-9a-f]+)"', self._parts["start"])
+        self.until("start", "selection")
+        found = re.search(r'name="selection" value="([0-9a-f]+)"', self._parts["start"])
         assert found
-        self.order("upgrade", target="bms", sha256=found[1])
+        self.order("upgrade", selection=found[1])
 
 
 def _in_browser(monkeypatch: pytest.MonkeyPatch, do: Callable[[_Browser], None]) -> None:

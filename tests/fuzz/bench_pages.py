@@ -30,7 +30,7 @@ _DEVICE_ORDERS: Final = ("adapter", "look", "watch", "areas", "backup", "upgrade
 they do then is not for a browser to choose.
 """
 _FIELDS: Final = (
-    "order", "name", "source", "waiver", "path", "target", "sha256", "risk", "bundle", "trace",
+    "order", "name", "source", "waiver", "path", "target", "selection", "risk", "bundle", "trace",
     "serial", "save",
 )  # fmt: skip
 

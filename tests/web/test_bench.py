@@ -36,6 +36,7 @@ from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.store import AREA_START
 from flasher.protocol.contents import VersionInformation
+from flasher.protocol.fields import WireText
 from flasher.protocol.spec import BMS, WELLING, Target
 from flasher.translation import translator
 from flasher.web.bench import BenchController, Order
@@ -56,7 +57,7 @@ def place(tmp_path: Path) -> BenchPlace:
 def _upgrade(state: BenchState) -> Order:
     assert state.target is not None
     assert state.offer is not None
-    return order(BenchController.upgrade, state.target.name, state.offer.sha256)
+    return order(BenchController.upgrade, state.selection)
 
 
 def _chosen(
@@ -229,15 +230,25 @@ def test_an_image_that_changed_since_it_was_chosen_is_not_sent(
 
 
 def test_an_order_from_a_page_that_was_not_up_to_date_sends_nothing(place: BenchPlace) -> None:
-    state = _chosen(place)
-    assert state.offer is not None
-    for ordered in (
-        order(BenchController.upgrade, "wmc", state.offer.sha256),
-        order(BenchController.upgrade, "bms", "0" * 64),
-    ):
-        state = place.do(ordered)
+    shown = _chosen(place).selection
+    image = order(BenchController.choose_image, IMAGE)
+    target = order(BenchController.choose_target, "bms")
+    for meanwhile in (
+        (order(BenchController.keep_settings, "yes"),),
+        (order(BenchController.choose_target, "wmc"), image),
+        (order(BenchController.use_adapter, BikeFault.EXCHANGED.value), target, image),
+        (
+            order(BenchController.start_over, is_rescue=True),
+            order(BenchController.use_adapter, BikeFault.NONE.value), target, image,
+        ),
+    ):  # fmt: skip
+        _chosen(place)
+        assert place.bench.state.selection == shown
+        place.do(*meanwhile)
+        state = place.do(order(BenchController.upgrade, shown))
         assert isinstance(state.trouble, UsageError)
         assert state.done is None
+        place.do(BenchController.start_over)
 
 
 def test_the_folder_of_images_is_chosen_and_remembered(place: BenchPlace, tmp_path: Path) -> None:
@@ -417,6 +428,26 @@ def test_a_device_whose_upgrade_failed_is_rescued_with_the_same_image(place: Ben
     assert place.bench.state.power_cycle_s is None
 
 
+def test_a_unit_that_is_rescued_is_not_taken_for_the_one_before(place: BenchPlace) -> None:
+    done = _done(place, BikeFault.POWER)
+    assert done.before is not None
+    state = place.do(BenchController.rescue_it)
+    assert state.bike is not None
+    version = state.bike.version
+    assert isinstance(version, VersionInformation)
+    other = replace(version, serial_number=WireText(b"W2605777"))
+    readings = tuple(
+        replace(each, answer=other) if each.answer is version else each
+        for each in state.bike.readings
+    )
+    place.bench.show(bike=replace(state.bike, readings=readings))
+    rescued = place.do(_upgrade(place.bench.state)).done
+    assert rescued is not None
+    assert rescued.before is None
+    assert rescued.after is not None
+    assert place.bench.state.session[-1].serial == "W2605001"
+
+
 def test_the_wait_for_a_lost_adapter_is_counted_down(place: BenchPlace) -> None:
     seen: list[int | None] = []
     put = place.bench.feed.put
@@ -520,7 +551,7 @@ def test_while_it_does_something_it_takes_no_other_order(place: BenchPlace) -> N
         order(BenchController.choose_target, "bms"),
         order(BenchController.use_adapter, "none"),
         BenchController.rescue_it,
-        order(BenchController.upgrade, "bms", ""),
+        order(BenchController.upgrade, ""),
         order(BenchController.waive, IMAGE, "hardware"),
     ],
 )
@@ -884,3 +915,14 @@ def test_the_profile_decides_first_whether_settings_are_kept(
     assert _chosen(place).keeps_settings is True
     assert place.do(order(BenchController.keep_settings, "no")).keeps_settings is False
     assert _chosen(place, target="wmc").keeps_settings is None, "the documents give none"
+
+
+def test_of_a_whole_bike_the_profile_decides_too(
+    place: BenchPlace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert place.do(
+        order(BenchController.use_adapter, BikeFault.NONE.value), BenchController.choose_bike
+    ).keeps_settings is False  # fmt: skip
+    profile = place.bikes.profile(BMS)
+    monkeypatch.setattr(place.bikes, "profile", lambda _: replace(profile, keep_settings=True))
+    assert place.do(BenchController.choose_bike).keeps_settings is True

@@ -50,9 +50,7 @@ def chosen(place: BenchPlace, fault: BikeFault = BikeFault.NONE) -> BenchState:
 
 
 def upgraded(place: BenchPlace) -> BenchState:
-    offer = place.bench.state.offer
-    assert offer is not None
-    return place.do(lambda bench: upgrade_bike(bench, offer.sha256))
+    return place.do(lambda bench: upgrade_bike(bench, bench.state.selection))
 
 
 def outcome(state: BenchState) -> dict[str, str]:

@@ -34,7 +34,7 @@ def chosen(place: BenchPlace, fault: BikeFault = BikeFault.NONE, target: str = "
 def upgraded(place: BenchPlace) -> BenchState:
     state = chosen(place)
     assert state.offer is not None
-    done = place.do(order(BenchController.upgrade, "bms", state.offer.sha256)).done
+    done = place.do(order(BenchController.upgrade, state.selection)).done
     assert done is not None
     assert done.error is None
     return place.do(
@@ -63,6 +63,17 @@ def test_another_version_than_the_image_is_reported_and_nothing_is_sent_to_chang
     assert again.compared is None, "it belonged to the bike before"
 
 
+def test_another_battery_than_the_one_shown_is_not_compared(place: BenchPlace) -> None:
+    chosen(place, BikeFault.EXCHANGED)
+    bike = place.bikes._bikes[BikeFault.EXCHANGED.value]
+    for socket in bike._places:
+        socket._device = socket._made()
+    state = place.do(compare)
+    assert state.compared is None
+    assert state.trouble is not None
+    assert state.trouble.code is ErrorCode.NOT_FOR_DEVICE
+
+
 def test_the_image_that_runs_is_confirmed(place: BenchPlace) -> None:
     upgraded(place)
     compared = place.do(compare).compared
@@ -76,7 +87,7 @@ def test_an_upgrade_makes_the_comparison_void(place: BenchPlace) -> None:
     state = chosen(place)
     place.do(compare)
     assert state.offer is not None
-    done = place.do(order(BenchController.upgrade, "bms", state.offer.sha256))
+    done = place.do(order(BenchController.upgrade, state.selection))
     assert done.compared is None
 
 
@@ -95,7 +106,7 @@ def test_a_device_without_a_version_query_cannot_be_compared(
 def test_a_device_in_its_bootloader_is_no_match(place: BenchPlace) -> None:
     state = chosen(place, BikeFault.POWER)
     assert state.offer is not None
-    place.do(order(BenchController.upgrade, "bms", state.offer.sha256))
+    place.do(order(BenchController.upgrade, state.selection))
     place.do(
         order(BenchController.choose_target, "bms"), order(BenchController.choose_image, IMAGE)
     )

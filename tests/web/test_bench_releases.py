@@ -52,7 +52,7 @@ def code_of(offer: Offer) -> ErrorCode | None:
 def upgraded(place: BenchPlace, state: BenchState) -> Done:
     assert state.target is not None
     assert state.offer is not None
-    done = place.do(order(BenchController.upgrade, state.target.name, state.offer.sha256)).done
+    done = place.do(order(BenchController.upgrade, state.selection)).done
     assert done is not None
     return done
 
@@ -140,7 +140,7 @@ def test_a_key_that_is_revoked_while_the_page_is_open_stops_the_upgrade(
     TrustStore().install(maker.chain)
     assert state.target is not None
     assert state.offer is not None
-    state = place.do(order(BenchController.upgrade, "bms", state.offer.sha256))
+    state = place.do(order(BenchController.upgrade, state.selection))
     assert state.done is None
     assert state.trouble is not None
     assert state.trouble.code is ErrorCode.RELEASE_UNSIGNED

@@ -207,7 +207,7 @@ def test_an_upgrade_that_fails(place: BenchPlace, fault: BikeFault) -> None:
         order(BikeBench.choose_image, "new.bin"),
     )
     assert state.offer is not None
-    state = place.do(order(BikeBench.upgrade, BMS.name, state.offer.sha256))
+    state = place.do(order(BikeBench.upgrade, state.selection))
     assert state.done is not None
     _check(_bench_pages(place, state), shows="State of the device")
     assert state.done.bundle is not None

@@ -42,7 +42,7 @@ class Session:
             order(BenchController.choose_image, IMAGE),
         )
         assert state.offer is not None
-        place.do(order(BenchController.upgrade, target, state.offer.sha256))
+        place.do(order(BenchController.upgrade, state.selection))
         put = self.bench.feed.put
 
         def seen(subject: str, state: BenchState, *, word: object) -> None:
