@@ -181,25 +181,40 @@ def test_virtual_units_that_are_exchanged_in_their_runs_pass_in_the_end(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("has_badges", [False, True])
 def test_a_golden_unit_is_checked_and_releases_the_line(
-    flasher: Flasher, recipe: Path, tmp_path: Path
+    flasher: Flasher,
+    recipe: Path,
+    badges: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    has_badges: bool,
 ) -> None:
     text = recipe.read_text("utf-8")
     golden = '\n[golden]\nserial_numbers = ["W2605000"]\nevery_h = 100\n'
     recipe.write_text(text + golden, "utf-8")
     file = tmp_path / "station.toml"
     head = 'name = "line-2"\nkeys = "keys"\ngolden_unit = "required"\n'
+    head += f'badges = "{badges}"\n' * has_badges
     file.write_text(head + '[[socket]]\nname = "A"\nmock = { bad = 0.0 }\n', "utf-8")
     words = ("station", "check", recipe, "--sockets", file, "--golden")
     wrong = flasher(*words, "W2605003")
     assert wrong.code == ExitCode.USAGE
     assert "it names W2605000" in wrong.err
+    if has_badges:
+        monkeypatch.setattr(sys, "stdin", io.StringIO("BADGE-9\n"))
+        unknown = flasher(*words, "W2605000", "--json")
+        assert unknown.code == ExitCode.USAGE
+        assert "not in the badge table" in unknown.err
+        monkeypatch.setattr(sys, "stdin", io.StringIO("BADGE-1\n"))
     run = flasher(*words, "W2605000", "--json")
     assert run.code == ExitCode.OK, run.err
     assert [unit["outcome"] for unit in lines_of(run)[1]["units"]] == ["pass"]
     with Store.open(str(tmp_path / "records.sqlite"), station="reader", create=False) as store:
         (row,) = store.read.noted("line-2", AuditEvent.RELEASED)
+        (details,) = store.read.unit("W2605000").runs
     assert (row["serial"], row["units"]) == ("W2605000", "virtual")
+    assert (details.run.operator == "Sue") is has_badges
 
 
 @pytest.mark.slow

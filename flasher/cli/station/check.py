@@ -16,7 +16,7 @@ from flasher.cli.station.documents import (
     StationCheckDocument,
 )
 from flasher.cli.station.run import run
-from flasher.cli.station.setup import check_clock, check_golden, labels_of
+from flasher.cli.station.setup import ask_secret, check_clock, check_golden, labels_of
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
 from flasher.station.adapters import check_samples, detect, resolve
@@ -30,7 +30,9 @@ from flasher.station.scans import Word
 def golden(
     output: Output, options: RunOptions, records: RecordsOptions, serial: str, socket: str | None
 ) -> int:
-    """Run a golden unit. Its PASS releases this flasher with the recipe at the station."""
+    """Run a golden unit. Its PASS releases this flasher with the recipe at the station. With a
+    badge table the badge of the operator is typed or scanned first.
+    """
     if records.sockets is None or options.recipe is None:
         raise UsageError("--golden needs the station file.", remedy="Give --sockets FILE.")
     recipe = load_checked(options.recipe, datetime.now().astimezone().date())
@@ -42,15 +44,26 @@ def golden(
             f"{printable(serial)} is no golden unit of the recipe: it names {listed}.",
             remedy="Name one of them, or add it to [golden] in the recipe.",
         )
-    names = [each.name for each in load_config(records.sockets).socket]
+    config = load_config(records.sockets)
+    names = [each.name for each in config.socket]
     if socket is None and len(names) > 1:
         raise UsageError(
             "The station has several sockets.",
             remedy=f"Give --socket with one of {', '.join(map(printable, names))}.",
         )
-    card = f"{Word.SOCKET.value} {socket or names[0]}"
+    scans = [f"{Word.SOCKET.value} {socket or names[0]}", serial]
+    if config.badges:
+        people = load_badges(Path(config.badges), recipe.recipe.serial_number)
+        badge = ask_secret("Badge: ")
+        if badge not in {each.code for each in people}:
+            raise UsageError(
+                "This badge is not in the badge table.",
+                remedy="Run the command again, and scan the badge of a person in"
+                f" {printable(config.badges)}.",
+            )
+        scans.insert(0, badge)
     pages = PagesOptions(None, None, None, web_insecure=False, language=None)
-    return run(output, options, pages, records, golden=[card, serial])
+    return run(output, options, pages, records, golden=scans)
 
 
 def check(output: Output, path: Path, station_file: Path | None) -> int:

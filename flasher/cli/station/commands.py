@@ -290,7 +290,8 @@ def check(
     output: Output, recipe: Path, sockets: Path | None, golden: str | None, socket: str | None
 ) -> int:
     """Check a recipe and its images, before a shift. With --golden a known good unit is flashed,
-    after an update of flasher or of the recipe. Exit code 12 if it did not pass.
+    after an update of flasher or of the recipe; a station with badges asks for the operator's. Exit
+    code 12 if it did not pass.
     """
     if golden is None:
         return _call("check.check", output, recipe, sockets)

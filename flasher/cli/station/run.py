@@ -87,10 +87,8 @@ def run(
     day = datetime.now().astimezone().date()
     local = None if options.recipe is None else load_checked(options.recipe, day)
     config, sockets = _find_sockets(options, records.sockets)
-    if golden:  # who runs the command is the operator
-        config = config.model_copy(
-            update={"badges": "", "plant_recipes": False, "golden_unit": "required"}
-        )
+    if golden:
+        config = config.model_copy(update={"plant_recipes": False, "golden_unit": "required"})
     if local is None and not config.plant_recipes:
         raise UsageError(
             "A station needs a recipe.",

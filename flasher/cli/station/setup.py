@@ -237,17 +237,17 @@ def scanners_of(config: StationConfig, station: Station) -> list[Scanner]:
 
 
 def pin(output: Output) -> int:
-    typed = _typed("PIN: ")
+    typed = ask_secret("PIN: ")
     if not is_form(typed):
         raise UsageError(f"A PIN has {FORM_WORDS}.", remedy="Type another one.")
-    if sys.stdin.isatty() and _typed("Repeat the PIN: ") != typed:
+    if sys.stdin.isatty() and ask_secret("Repeat the PIN: ") != typed:
         raise UsageError("The two PINs differ.", remedy="Run the command again.")
     document = PinDocument(pin=hash_of(Pin(typed)))
     output.result(document.pin)
     return output.document(document)
 
 
-def _typed(prompt: str) -> str:
+def ask_secret(prompt: str) -> str:
     """Read a line without echo from a terminal, or the first line of a pipe."""
     if sys.stdin is None or not sys.stdin.isatty():
         return "" if sys.stdin is None else sys.stdin.readline().strip()
