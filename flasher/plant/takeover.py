@@ -396,13 +396,15 @@ class _Copy:
     def add_open(
         self, connection: Connection, runs: Iterable[tuple[Mapping[str, Any], Mapping[str, Any]]]
     ) -> None:
-        """Add active runs; the station ends them as interrupted when it starts."""
+        """Add active runs; the station ends them as interrupted when it starts. One may have ended
+        at the other PC before its claim was sent: how it ended is not here.
+        """
         before = {name: set(ids) for name, ids in self._seen.items()}
         self.active = []
         for own, named in runs:
             self._add_shared(connection, named, own)
-            self._insert(connection, "run", [own["run"]])
-            self._insert(connection, "run_target", own["targets"])
+            self._insert(connection, "run", [{**own["run"], **chain.UNENDED}])
+            self._insert(connection, "run_target", [t | {"reached": None} for t in own["targets"]])
             self.active.append(own["unit"]["serial"])
         self._seen = before  # a refused attempt takes them back
 

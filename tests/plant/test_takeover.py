@@ -172,6 +172,28 @@ def _take_back(plant: Plant, sender: Sender, spare: Sender, unsent: int) -> None
     assert not old.store.examine(incremental=True).problems
 
 
+def test_a_run_that_ended_and_was_sent_without_its_end_is_interrupted(
+    plant: Plant, sender: Sender, key: bytes, spares: list[Sender], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A batch ended between the two, and the PC died before the next one."""
+    sender.bench.make(serial="W2605001")
+    sender.send()
+    sender.bench.make(serial="W2605002")
+    monkeypatch.setattr("flasher.plant.forwarder.BATCH_ROWS", 1)
+    sender.forwarder.forward()
+    monkeypatch.undo()
+    assert taken(plant, key).active == ("W2605002",)
+    spares.append(spare := spare_of(plant, sender))
+    assert states(spare) == {"W2605001": UnitState.PASS, "W2605002": UnitState.RECHECK}
+    assert not spare.bench.store.examine().problems
+    sender.bench.store.close()
+    brought(spare, sender.bench.path)
+    assert states(spare)["W2605002"] is UnitState.PASS
+    spare.send()
+    assert not spare.bench.store.examine().problems
+    assert not examined(plant).problems
+
+
 def test_a_unit_that_passes_at_both_pcs_is_named(
     plant: Plant, sender: Sender, key: bytes, spares: list[Sender]
 ) -> None:
@@ -233,6 +255,46 @@ def test_a_pc_that_was_taken_over_claims_nothing(plant: Plant, sender: Sender, k
     old.claims.tend()
     assert "taken-over" in old.asked("W2605003").doubt
     old.close()
+
+
+@pytest.mark.parametrize("sent", [1, 2, 4, 6])
+def test_a_branch_that_was_sent_in_part_is_completed_after_the_next_takeover(
+    plant: Plant, sender: Sender, key: bytes, spares: list[Sender], sent: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    old = Line(plant, "line-2", sender)
+    sender.bench.make(serial="W2605001")
+    sender.send()
+    for serial in ("W2605002", "W2605003", "W2605004"):
+        old.end(old.claim(serial))
+    taken(plant, key)
+    spares.append(second := spare_of(plant, sender))
+    second.send()
+    sender.bench.store.close()
+    assert len(brought(second, sender.bench.path).runs) == 3
+    monkeypatch.setattr("flasher.plant.forwarder.BATCH_ROWS", sent)
+    second.forwarder.forward()
+    monkeypatch.undo()
+    taken(plant, key, "third")
+    spares.append(third := spare_of(plant, sender, "third"))
+    line = Line(plant, "line-2", third)
+    line.claims.tend()
+    assert plant.rows("SELECT count(*) FROM plant_claim") == [(3 - (sent - 1) // 2,)]
+    brought(third, sender.bench.path)
+    with pytest.raises(NotFoundError):
+        brought(third, sender.bench.path)
+    line.start()
+    line.claims.tend()
+    third.send()
+    serials = [f"W260500{number}" for number in (1, 2, 3, 4)]
+    assert states(third) == dict.fromkeys(serials, UnitState.PASS)
+    passed = "SELECT serial FROM run JOIN unit u ON u.id = unit_id WHERE state = 'PASS' ORDER BY 1"
+    assert plant.rows(passed) == [(each,) for each in serials]
+    assert plant.rows("SELECT * FROM plant_claim") == []
+    assert not third.bench.store.examine().problems
+    assert not examined(plant).problems
+    for each in (old, line):
+        each.claims.close()
 
 
 def test_a_changed_branch_is_not_brought_in(

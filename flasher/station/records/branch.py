@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from itertools import zip_longest
 from typing import Any, Final
 
 from sqlalchemy import Connection, func, select, update
@@ -28,7 +29,7 @@ from flasher.station.records.store import Store
 _ROW: Final = (
     "number", "at", "event", "run_id", "data", "previous_hash", "hash", "signature",
 )  # fmt: skip
-_UNENDED: Final = {
+_DIED: Final = {
     "state": RunState.INTERRUPTED.value,
     "code": "STATION_DIED",
     "text": "The station ended before this run did. The unit has to be checked.",
@@ -63,6 +64,7 @@ def bring_in(
             fork = _fork(own, other, store)
             key = chain.key_in_force(own, store.station, fork + 1)
         rows = _rows_after(other, store.station, fork)
+        takeover = chain.last_takeover(other, store.station)
         if not rows:
             raise NotFoundError(
                 "The station has every row of these records.",
@@ -78,7 +80,8 @@ def bring_in(
     with store.signer.writing() as trail:
         connection = trail.connection
         named = {"first": rows[0]["number"], "last": rows[-1]["number"], "head": rows[-1]["hash"]}
-        trail.append(now, chain.BRANCH, {**named, "by": by, "reason": reason})
+        decided = {"takeover": takeover, "by": by, "reason": reason}
+        trail.append(now, chain.BRANCH, {**named, **decided})
         numbers = _free_numbers(connection, contents)
         added = {
             run_id: _Run(content, numbers[run_id]).add(connection, store.station, now)
@@ -97,18 +100,53 @@ def bring_in(
             trail.append(now, event, data, run_id)
         for run_id, content in contents.items():
             if content["run"]["state"] == RunState.RUNNING.value:
-                ended = {"state": _UNENDED["state"], "digests": digests[numbers[run_id]]}
+                ended = {"state": _DIED["state"], "digests": digests[numbers[run_id]]}
                 trail.append(now, chain.INTERRUPTED, ended, numbers[run_id])
         conflicts = _passed_twice(connection, numbers.values())
     return BroughtIn(store.station, **named, runs=tuple(numbers.values()), conflicts=conflicts)
 
 
+@dataclass(frozen=True)
+class Branch:
+    """A branch in a station's records."""
+
+    takeover: str | None
+    """Hash of the row with which its PC took the station over; "" for the first PC, None if the
+    records do not state it.
+    """
+    head: str
+    """Hash of its last row."""
+    last: int
+    """Number of its last row."""
+    here: int
+    """Number of the last of its rows that is here: a PC that took the station over while the
+    branch was sent lacks the rest.
+    """
+
+    @property
+    def is_whole(self) -> bool:
+        return self.here == self.last
+
+
+def branches(connection: Connection, station: str) -> list[Branch]:
+    """What was brought into a station's records, in order."""
+    found = []
+    rows = chain.rows_without_run(connection, station, [chain.BRANCH, chain.TAKEN_OVER])
+    for row, following in zip_longest(rows, rows[1:]):
+        if row.event == chain.BRANCH:
+            data = chain.data_of(row.data)
+            here = data["last"]
+            if following is not None:
+                here = min(here, data["first"] + following.number - row.number - 2)
+            found.append(Branch(data.get("takeover"), data["head"], data["last"], here))
+    return found
+
+
 def _fork(own: Connection, other: Connection, store: Store) -> int:
     """The last row of `other` that the station has, or has brought in. Raises RecordError."""
-    for row in reversed(chain.rows_without_run(own, store.station, [chain.BRANCH])):
-        named = chain.data_of(row.data)
-        if chain.hash_at(other, store.station, named["last"]) == named["head"]:
-            return int(named["last"])
+    for each in reversed(branches(own, store.station)):
+        if chain.hash_at(other, store.station, each.last) == each.head:
+            return each.here
     low, high = 0, _last(other, store.station)
     while low < high:  # rows are equal up to the fork, and none after it
         middle = (low + high + 1) // 2
@@ -214,8 +252,7 @@ class _Run:
         content, number = self._content, self._number
         run = dict(content["run"])
         if run["state"] == RunState.RUNNING.value:
-            run |= _UNENDED | {"ended_at": max(utc_text(now), run["begun_at"])}
-        begun = dict.fromkeys(chain.OUTCOME) | {"state": "RUNNING", "code": "", "text": ""}
+            run |= _DIED | {"ended_at": max(utc_text(now), run["begun_at"])}
         socket = {"name": content["socket"]["name"]}
         socket["station_id"] = find_or_insert(connection, schema.station, name=station)
         ids = {
@@ -225,7 +262,7 @@ class _Run:
             "lot_id": content["lot"] and self._id(connection, "lot", "part", "name"),
             "socket_id": find_or_insert(connection, schema.socket, **socket),
         }
-        insert(connection, schema.run, **(run | begun | ids | {"id": number}))
+        insert(connection, schema.run, **(run | chain.UNENDED | ids | {"id": number}))
         for target, image in zip(content["targets"], content["artifacts"], strict=True):
             image_id = _found(connection, "artifact", image, "target", "sha256", "name")
             self._part(connection, "run_target", target, artifact_id=image_id)

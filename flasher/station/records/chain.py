@@ -17,7 +17,7 @@ from sqlalchemy import Connection, Row, Select, Table, bindparam, select
 
 from flasher.station.records import schema
 from flasher.station.records.heads import ChainHead
-from flasher.station.records.model import AuditEvent, utc_text
+from flasher.station.records.model import AuditEvent, RunState, utc_text
 from flasher.station.records.rows import KEYS, beside_index, find_or_insert, grouped, insert
 from flasher.station.records.schema import audit, station
 from flasher.station.records.signatures import SigningKey
@@ -210,6 +210,12 @@ def accepted_losses(connection: Connection, station_name: str) -> list[range]:
     return [lost_of(data_of(row.data)) for row in rows]
 
 
+def last_takeover(connection: Connection, station_name: str) -> str:
+    """Hash of the row with which this PC took the station over; "" for the first PC."""
+    rows = rows_without_run(connection, station_name, [TAKEN_OVER])
+    return rows[-1].hash if rows else ""
+
+
 def runs_from(data: Mapping[str, Any]) -> int:
     """The lowest number for a run after a TAKEN_OVER row."""
     found = data.get("runs_from")
@@ -272,6 +278,10 @@ OUTCOME: Final = frozenset(
     ["state", "code", "text", "ended_at", "ended_monotonic_s", "verification_reached", "log_sha256"]
 )
 """Columns of a run that are set when it ends."""
+UNENDED: Final[dict[str, Any]] = dict.fromkeys(OUTCOME) | {
+    "state": RunState.RUNNING.value, "code": "", "text": "",
+}  # fmt: skip
+"""Values of these columns before."""
 
 
 _MEASUREMENTS: Final = (
