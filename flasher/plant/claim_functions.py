@@ -15,7 +15,6 @@ from __future__ import annotations
 from typing import Final
 
 from flasher.plant.functions import DEFINER, REFUSED
-from flasher.station.records.chain import TAKEN_OVER
 from flasher.station.records.model import PLANT_CLAIM, RunKind, StepName
 
 _OPEN_MAX: Final = 1000
@@ -24,33 +23,31 @@ _LEASE_MAX_S: Final = 600
 
 # Both had other arguments or results once.
 _OLD: Final = """
+DROP FUNCTION IF EXISTS plant_claim(text, text, text, boolean, text, double precision, text);
 DROP FUNCTION IF EXISTS plant_claim(text, text, text, boolean, text, double precision);
 DROP FUNCTION IF EXISTS plant_claims();
 """
 _CLAIM: Final = f"""
 CREATE OR REPLACE FUNCTION plant_claim(
     of_token text, of_part text, of_serial text, of_virtual boolean, at_socket text,
-    lease_s double precision, of_takeover text,
+    lease_s double precision, of_records text, of_takeover text,
     OUT state text, OUT station text, OUT socket text, OUT at timestamptz, OUT run bigint
 ) LANGUAGE plpgsql {DEFINER} AS $$
 DECLARE
     mine plant_station;
     other plant_claim;
     now timestamptz;
-    taken text;
 BEGIN
+    PERFORM pg_advisory_xact_lock(hashtextextended(of_part || E'\\x1f' || of_serial, 7053));
+    -- After the lock: another PC may have taken the station over, and run the unit, meanwhile.
     SELECT * INTO mine FROM plant_station p WHERE p.role = session_user;
-    IF mine.station IS NULL THEN
-        RAISE EXCEPTION 'foreign: the user % has not sent from any records', session_user
+    IF mine.station IS NULL OR mine.records_id <> of_records THEN
+        RAISE EXCEPTION 'foreign: station % sends from other records', coalesce(mine.name, '')
             USING ERRCODE = '{REFUSED}';
-    END IF;
-    SELECT c.hash INTO taken FROM chain_row c WHERE c.station = mine.station
-        AND c.event = '{TAKEN_OVER}' ORDER BY c.number DESC LIMIT 1;
-    IF taken <> of_takeover THEN
+    ELSIF mine.takeover NOT IN ('', of_takeover) THEN
         RAISE EXCEPTION 'taken-over: another PC continues station %', mine.name
             USING ERRCODE = '{REFUSED}';
     END IF;
-    PERFORM pg_advisory_xact_lock(hashtextextended(of_part || E'\\x1f' || of_serial, 7053));
     now := clock_timestamp();
     -- Claims before runs: a claim goes when the end of its run comes.
     SELECT * INTO other FROM plant_claim c WHERE c.part = of_part AND c.serial = of_serial
@@ -77,8 +74,10 @@ BEGIN
         END IF;
     END IF;
     IF state IN ('running', 'unknown') THEN
-        SELECT p.name, other.socket, other.claimed_at INTO station, socket, at
-            FROM plant_station p WHERE p.station = other.station;
+        socket := other.socket;
+        at := other.claimed_at;
+        station := coalesce((SELECT p.name FROM plant_station p WHERE p.station = other.station),
+            'a station whose records were replaced');
     END IF;
     IF state IS DISTINCT FROM 'running' THEN
         IF (SELECT count(*) FROM plant_claim c WHERE c.station = mine.station
@@ -155,6 +154,7 @@ FUNCTIONS: Final = (_OLD, _CLAIM, _RENEW, _RELEASE, _CLAIMS, _END, _TRIGGER)
 def rights(stations: str) -> str:
     """Statement that gives the role of all stations its rights; the name is quoted."""
     return f"""
-GRANT EXECUTE ON FUNCTION plant_claim(text, text, text, boolean, text, double precision, text),
+GRANT EXECUTE ON FUNCTION
+    plant_claim(text, text, text, boolean, text, double precision, text, text),
     plant_renew(text[], double precision), plant_release(text[]), plant_claims() TO {stations};
 """

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 from contextlib import closing
+from dataclasses import dataclass
 from datetime import datetime
 from typing import Final
 
@@ -18,6 +19,7 @@ from flasher.log import log_event
 from flasher.plant.central import Central
 from flasher.plant.forwarder import ENTER
 from flasher.station.records import chain, schema
+from flasher.station.records.branch import branches
 from flasher.station.records.database import Database
 from flasher.station.records.errors import RecordError
 from flasher.station.records.model import (
@@ -41,7 +43,8 @@ than a second meanwhile."""
 _CLOSE_S: Final = 3.0
 
 _CLAIM: Final = text(
-    "SELECT * FROM plant_claim(:token, :part, :serial, :is_virtual, :socket, :lease_s, :takeover)"
+    "SELECT * FROM plant_claim(:token, :part, :serial, :is_virtual, :socket, :lease_s, :records,"
+    " :takeover)"
 )
 _RENEW: Final = text("SELECT plant_renew(:tokens, :lease_s)")
 _RELEASE: Final = text("SELECT plant_release(:tokens)")
@@ -67,6 +70,20 @@ def _offset_s(clocks: tuple[float, float], clock: StationClock) -> float:
     return clock.utc().timestamp() - (clock.monotonic_s() + clocks[0])
 
 
+@dataclass(frozen=True)
+class _Own:
+    """Which records and which PC a station is."""
+
+    records: str
+    """Id of the records."""
+    takeover: str
+    """Hash of the audit row with which this PC took the station over; "" for the first PC."""
+    known: frozenset[str | None]
+    """PCs whose runs these records have, each by its takeover: this one, and those that were
+    brought in.
+    """
+
+
 class PlantClaims:
     """Claims of one station (`flasher.station.gate.Claims`). `is_kept` starts the thread that
     renews them; otherwise the owner calls `tend`.
@@ -89,11 +106,9 @@ class PlantClaims:
         self._kept: set[str] = set()
         self._left: set[str] = set()
         """Claims with which no run began."""
-        self._is_entered = self._is_swept = False
-        self._takeover = ""
-        """Hash of the audit row with which this PC took the station over; "" without one."""
-        self._has_branches = False
-        """True if the records of each PC that was taken over were brought in."""
+        self._is_swept = False
+        self._own: _Own | None = None
+        """None before this station has stated it."""
         self._fault: RecordError | None = None
         """Why the server did not answer last; None if it did."""
         self._clocks: tuple[float, float] | None = None
@@ -124,8 +139,8 @@ class PlantClaims:
         }
         try:
             with self._central.writing() as central:
-                self._enter(central)
-                values["takeover"] = self._takeover
+                own = self._enter(central)
+                values |= {"records": own.records, "takeover": own.takeover}
                 found = central.execute(_CLAIM, values).mappings().one()
         except RecordError as error:
             with self._mutex:
@@ -175,9 +190,9 @@ class PlantClaims:
             kept, left = sorted(self._kept), sorted(self._left)
         try:
             with self._central.writing() as central:
-                self._enter(central)
+                own = self._enter(central)
                 if not self._is_swept:
-                    left += self._unknown(central)
+                    left += self._unknown(central, own)
                 if left:
                     central.execute(_RELEASE, {"tokens": left})
                 central.execute(_RENEW, {"tokens": kept, "lease_s": LEASE_S})
@@ -193,28 +208,27 @@ class PlantClaims:
             self._left.difference_update(left)
             self._fault = None
 
-    def _enter(self, central: Connection) -> None:
+    def _enter(self, central: Connection) -> _Own:
         """State once from which records this station sends."""
-        if self._is_entered:
-            return
+        if self._own is None:
+            own = self._read()
+            central.execute(ENTER, {"records": own.records, "station": self._station})
+            self._own = own
+        return self._own
+
+    def _read(self) -> _Own:
         with self._records.reading() as local:
             records = str(local.execute(select(schema.schema_info.c.records_id)).scalar_one())
-            takeovers = chain.rows_without_run(local, self._station, [chain.TAKEN_OVER])
-            branches = chain.rows_without_run(local, self._station, [chain.BRANCH])
-        central.execute(ENTER, {"records": records, "station": self._station})
-        self._takeover = takeovers[-1].hash if takeovers else ""
-        self._has_branches = len(branches) >= len(takeovers)
-        self._is_entered = True
+            takeover = chain.last_takeover(local, self._station)
+            last = {each.takeover: each for each in branches(local, self._station)}
+        whole = {takeover for takeover, branch in last.items() if branch.is_whole}
+        return _Own(records, takeover, frozenset({takeover, *whole}))
 
-    def _unknown(self, central: Connection) -> list[str]:
-        """Claims of this station with which no run began: the station died in between. What a PC
-        that was taken over has run is not known before its records are brought in.
+    def _unknown(self, central: Connection, own: _Own) -> list[str]:
+        """Claims of this station with which no run began: the station died in between. What another
+        PC has run as this station is not known before its records are brought in.
         """
-        claims = [
-            each
-            for each in central.execute(_CLAIMS).all()
-            if self._has_branches or each.takeover == self._takeover
-        ]
+        claims = [each for each in central.execute(_CLAIMS).all() if each.takeover in own.known]
         with self._mutex:
             earlier = [each for each in claims if each.token not in self._asked]
         return [

@@ -255,9 +255,11 @@ class Forwarder:
         where = self._central.shown
         with self._central.writing() as central:
             taken: Any = central.execute(_TAKEN_OVER).one_or_none()
-        if taken and chain.hash_at(local, self._station, taken.number) != taken.hash:
-            data = chain.data_of(taken.data)
-            what = f"{data.get('computer')} runs the station since {taken.at[:19]} UTC"
+        if taken and chain.last_takeover(local, self._station) != taken.hash:
+            what = "another PC runs the station"
+            if taken.data is not None:
+                computer = chain.data_of(taken.data).get("computer")
+                what = f"{computer} runs the station since {taken.at[:19]} UTC"
             raise ChainRefusedError(Refusal.TAKEN_OVER, what, where=where)
         if found is None:
             what = f"the plant has row {head.number}, the station does not"

@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import Final
 
 from flasher.plant.schema import OWN_PARTS, SHARED_PARTS
+from flasher.station.records.chain import TAKEN_OVER
 
 REFUSED: Final = "FL001"
 """SQLSTATE of a refused chain. The message begins with one of the `Refusal` words."""
@@ -41,7 +42,10 @@ BEGIN
             USING ERRCODE = '{REFUSED}';
     END IF;
     IF mine.station IS NULL THEN
-        UPDATE plant_station p SET station = wanted, records_id = of_records, entered_at = now()
+        UPDATE plant_station p
+            SET station = wanted, records_id = of_records, entered_at = now(),
+                takeover = coalesce((SELECT c.hash FROM chain_row c WHERE c.station = wanted
+                    AND c.event = '{TAKEN_OVER}' ORDER BY c.number DESC LIMIT 1), '')
             WHERE p.role = session_user;
     ELSIF mine.station <> wanted THEN
         RAISE EXCEPTION 'foreign: station % sends from other records, those with id %', called,
@@ -215,6 +219,9 @@ BEGIN
     SELECT id INTO NEW.station_id FROM station WHERE name = mine.name;
     NEW.station_id := coalesce(NEW.station_id,
         plant_named('station', '{{name}}', jsonb_build_object('name', mine.name)));
+    IF NEW.event = '{TAKEN_OVER}' THEN
+        UPDATE plant_station SET takeover = NEW.hash WHERE role = session_user;
+    END IF;
     IF NEW.content IS NULL THEN
         IF NEW.run_number IS NOT NULL THEN
             SELECT run_id INTO NEW.run_id FROM chain_row WHERE station = NEW.station

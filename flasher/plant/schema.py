@@ -34,7 +34,7 @@ from sqlalchemy.dialects.postgresql import JSON
 
 from flasher.station.records import schema as station_schema
 
-PLANT_SCHEMA: Final = "7"
+PLANT_SCHEMA: Final = "8"
 """The newest Alembic revision in `migrations.versions`."""
 VERSION_TABLE: Final = "plant_version"
 STATION_TABLES: Final = tuple(
@@ -62,10 +62,12 @@ plant_station: Final = Table(
     Column("refusal", Text, nullable=False, server_default=""),
     Column("other_refusal", Text, nullable=False, server_default=""),
     Column("other_reported_at", DateTime(timezone=True)),
+    Column("takeover", Text, nullable=False, server_default=""),
 )
 """A station that may send, by its role, and what it reported last. `station` identifies the chain
 of a station in its records; it is set when the station first connects. `other_...`: report of a PC
-that still runs as this station, although another one has taken it over."""
+that still runs as this station, although another one has taken it over. `takeover`: hash of the
+audit row of the last takeover, which may be retired."""
 
 chain_row: Final = Table(
     "chain_row",

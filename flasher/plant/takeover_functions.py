@@ -11,12 +11,12 @@ _TAKEN_OVER: Final = f"""
 CREATE OR REPLACE FUNCTION plant_taken_over(
     OUT number bigint, OUT hash text, OUT at text, OUT data text
 ) RETURNS SETOF record LANGUAGE sql STABLE {DEFINER} AS $$
-    SELECT c.number, c.hash, c.at, c.data FROM chain_row c
-        WHERE c.station = plant_my_station() AND c.event = 'taken over'
-        ORDER BY c.number DESC LIMIT 1
+    SELECT c.number, p.takeover, c.at, c.data FROM plant_station p
+        LEFT JOIN chain_row c ON c.hash = p.takeover
+        WHERE p.role = session_user AND p.takeover <> ''
 $$
 """
-"""The last takeover of the station that asks."""
+"""The last takeover of the station that asks. Of one that was retired the hash is left."""
 
 _REPORT: Final = f"""
 CREATE OR REPLACE FUNCTION plant_report_other(refused text) RETURNS void
@@ -27,7 +27,7 @@ $$
 """
 """Report of a PC that was taken over: it leaves the report of the station as it is."""
 
-_CLOSE: Final = f"""
+CLOSE: Final = f"""
 CREATE OR REPLACE FUNCTION plant_close() RETURNS trigger LANGUAGE plpgsql {DEFINER} AS $$
 BEGIN
     DELETE FROM open_run WHERE station = NEW.station AND run_number = NEW.run_number;
@@ -35,7 +35,7 @@ BEGIN
 END $$
 """
 
-FUNCTIONS: Final = (_TAKEN_OVER, _REPORT, _CLOSE)
+FUNCTIONS: Final = (_TAKEN_OVER, _REPORT, CLOSE)
 ONCE: Final = """
 CREATE TRIGGER plant_close AFTER INSERT ON chain_row FOR EACH ROW
     WHEN (NEW.event IN ('finished', 'interrupted')) EXECUTE FUNCTION plant_close();

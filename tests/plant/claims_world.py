@@ -16,7 +16,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from flasher.plant import claims
-from flasher.plant.claims import LEASE_S, PlantClaims
+from flasher.plant.claims import LEASE_S, PlantClaims, _Own
 from flasher.station.gate import Gate
 from flasher.station.records.errors import RecordError
 from flasher.station.records.model import Admission, ElsewhereState, Order
@@ -32,6 +32,7 @@ class Claimed:
     serial: str
     at: datetime
     expires_at: datetime
+    takeover: str
 
 
 @dataclass
@@ -42,17 +43,31 @@ class Centre:
     claims: dict[str, Claimed] = field(default_factory=dict)
     passed: list[tuple[str, str, int]] = field(default_factory=list)
     """Station, serial number and run of each PASS that arrived."""
+    takeovers: dict[str, str] = field(default_factory=dict)
+    """The last takeover of a station."""
 
-    def claim(self, station: str, token: str, serial: str, lease_s: float) -> str | None:
+    def claim(
+        self, station: str, token: str, serial: str, lease_s: float, takeover: str = ""
+    ) -> str | None:
         """State of the unit elsewhere."""
         now = self.clock.now
-        others = [c for c in self.claims.values() if c.serial == serial and c.station != station]
+        if self.takeovers.get(station, takeover) != takeover:
+            raise RecordError("The plant refuses this station's audit trail, taken-over.")
+        others = [
+            each
+            for each in self.claims.values()
+            if each.serial == serial and not self.is_own(each, station, takeover)
+        ]
         if any(each.expires_at > now for each in others):
             return "running"
-        self.claims[token] = Claimed(station, serial, now, now + timedelta(seconds=lease_s))
+        expires_at = now + timedelta(seconds=lease_s)
+        self.claims[token] = Claimed(station, serial, now, expires_at, takeover)
         if any(s == serial and name != station for name, s, _ in self.passed):
             return "passed"
         return "unknown" if others else None
+
+    def is_own(self, claim: Claimed, station: str, takeover: str) -> bool:
+        return (claim.station, claim.takeover) == (station, takeover)
 
     def renew(self, station: str, tokens: list[str], lease_s: float) -> None:
         for token in tokens:
@@ -100,7 +115,8 @@ class _Link:
     def execute(self, statement: Any, values: Any = None) -> Any:
         centre, station = self.centre, self.station
         if statement is claims._CLAIM:
-            state = centre.claim(station, values["token"], values["serial"], values["lease_s"])
+            names = ("token", "serial", "lease_s", "takeover")
+            state = centre.claim(station, *(values[name] for name in names))
             row = {"state": state, "station": "other", "socket": "A", "at": BEGIN, "run": 1}
             return SimpleNamespace(mappings=lambda: SimpleNamespace(one=lambda: row))
         if statement is claims._RENEW:
@@ -109,7 +125,7 @@ class _Link:
             centre.release(station, values["tokens"])
         elif statement is claims._CLAIMS:
             own = [
-                SimpleNamespace(token=token, part=PART, serial=each.serial, takeover="")
+                SimpleNamespace(token=token, part=PART, serial=each.serial, takeover=each.takeover)
                 for token, each in centre.claims.items()
                 if each.station == station
             ]
@@ -126,19 +142,30 @@ class _Claims(PlantClaims):
     def __init__(self, station: Station, link: _Link) -> None:
         self._of = station
         super().__init__(link, None, station.name, station.clock, is_kept=False)  # type: ignore[arg-type]
-        self._is_entered = True
+
+    def _read(self) -> _Own:
+        known = frozenset({self._of.takeover, *self._of.brought})
+        return _Own("", self._of.takeover, known)
 
     def _recorded(self, part: str, serial: str) -> set[str]:
         return {run.claim for run in self._of.runs}
 
 
 class Station:
-    """A station whose recipe refuses duplicates, and allows what cannot be checked with a mark."""
+    """A PC that runs as a station whose recipe refuses duplicates, and allows what cannot be
+    checked with a mark.
+    """
 
-    def __init__(self, world: World, name: str, *, blocks: bool) -> None:
+    claims_of: type[_Claims] = _Claims
+
+    def __init__(self, world: World, name: str, *, blocks: bool, takeover: str = "") -> None:
         self.name, self.clock, self.blocks = name, world.clock, blocks
+        self.takeover = takeover
         self.link = _Link(world.centre, name)
         self.runs: list[Run] = []
+        self.brought: dict[str, list[Run]] = {}
+        """Runs of PCs that were taken over and brought in, by their takeover."""
+        self.is_gone = False
         self._recipe: Any = SimpleNamespace(
             part=PART, golden=None, plant=SimpleNamespace(time_limit_s=3.0)
         )
@@ -151,7 +178,7 @@ class Station:
                 run.state = "INTERRUPTED"
         self._threads: list[Callable[[], None]] = []
         self.admission: Admission | None = None
-        self.claims = _Claims(self, self.link)
+        self.claims = self.claims_of(self, self.link)
         self.gate = Gate(
             self._recipe, self.claims, None, self.clock.monotonic_s, start=self._threads.append
         )
@@ -164,7 +191,8 @@ class Station:
     # -- events -----------------------------------------------------------------------------------
 
     def ask(self) -> None:
-        has_passed = bool(self.runs) and self.runs[-1].state == "PASS"
+        # Not the last run alone: `bring_in` names a unit that passed at the other PC and ran here.
+        has_passed = any(run.state == "PASS" for run in self.runs)
         if not (has_passed or self.is_asking or self.active or self.admission):
             self.gate.ask(Order(SERIAL, "A", "jo"))
             self.is_asking = True
@@ -203,26 +231,64 @@ class Station:
     def send(self, centre: Centre) -> None:
         """The oldest run that has ended and was not sent."""
         run = next((each for each in self.runs if not each.is_sent), None)
+        if centre.takeovers.get(self.name, self.takeover) != self.takeover:
+            return
         if self.link.is_up and run is not None and run.state != "RUNNING":
             run.is_sent = True
             is_pass = run.state == "PASS"
             centre.end(self.name, run.claim, SERIAL, run.number, is_pass=is_pass)
 
+    def spare(self, world: World, takeover: str) -> Station:
+        """A spare PC that takes the station over, with what the plant has of it."""
+        made = type(self)(world, self.name, blocks=self.blocks, takeover=takeover)
+        made.runs = [run for run in self.runs if run.is_sent]
+        made.brought = {
+            of: runs for of, runs in self.brought.items() if all(run.is_sent for run in runs)
+        }
+        made.start()
+        world.centre.takeovers[self.name] = takeover
+        return made
+
+    def bring_in(self, other: Station) -> None:
+        """Bring in what another PC ran as this station. Both are ended before."""
+        other.start()
+        other.is_gone = True
+        runs = [run for run in other.runs if run not in self.runs]
+        self.runs = [*runs, *self.runs]
+        self.brought[other.takeover] = runs
+        self.start()
+
 
 class World:
-    def __init__(self, seed: int, centre: type[Centre] = Centre) -> None:
+    def __init__(
+        self, seed: int, centre: type[Centre] = Centre, station: type[Station] = Station
+    ) -> None:
         self.random = random.Random(seed)
         self.clock = FakeClock(BEGIN)
         self.centre = centre(self.clock)
-        count = self.random.choice((2, 2, 3))
+        count = self.random.choice((1, 2, 2, 3))
         self.stations = [
-            Station(self, f"line-{number}", blocks=self.random.random() < 0.2)
+            station(self, f"line-{number}", blocks=self.random.random() < 0.2)
             for number in range(count)
         ]
         self.log: list[str] = []
 
+    def take_over(self, station: Station) -> None:
+        """A spare PC goes on as the station, which may still run, and may be taken over itself."""
+        if self.newest(station) is station:
+            self.stations.append(station.spare(self, f"takeover {len(self.stations)}"))
+
+    def newest(self, station: Station) -> Station:
+        """The PC that took the station over last."""
+        return [each for each in self.stations if each.name == station.name][-1]
+
+    def bring_in(self, station: Station) -> None:
+        newest = self.newest(station)
+        if newest is not station:
+            newest.bring_in(station)
+
     def step(self) -> None:
-        station = self.random.choice(self.stations)
+        station = self.random.choice([each for each in self.stations if not each.is_gone])
         events: list[tuple[int, str, Callable[[], None]]] = [
             (6, "attempt", station.attempt),
             (3, "ask", station.ask),
@@ -234,6 +300,8 @@ class World:
             (5, "send", lambda: station.send(self.centre)),
             (4, "tend", station.claims.tend),
             (1, "die", station.start),
+            (2, "take over", lambda: self.take_over(station)),
+            (2, "bring in", lambda: self.bring_in(station)),
             (1, "server away", lambda: setattr(station.link, "is_up", False)),
             (2, "server back", lambda: setattr(station.link, "is_up", True)),
             (1, "answer lost", lambda: setattr(station.link, "loses_answer", True)),
@@ -242,17 +310,17 @@ class World:
             (2, "lease", lambda: self.clock.go_on(LEASE_S + 1)),
         ]
         _, name, act = self.random.choices(events, [weight for weight, _, _ in events])[0]
-        self.log.append(f"{station.name}: {name}")
+        self.log.append(f"{station.name} {station.takeover}: {name}")
         act()
         self.check()
 
     def check(self) -> None:
-        passed = [
-            f"{station.name} run {run.number}"
+        passed = {
+            run.claim: f"{station.name} run {run.number}"
             for station in self.stations
             for run in station.runs
             if run.state == "PASS" and not run.is_marked
-        ]
+        }
         assert len(passed) <= 1, (passed, self.log)
 
     def run(self, steps: int = 60) -> None:
@@ -260,8 +328,13 @@ class World:
             self.step()
 
     def settle(self) -> None:
-        """Everything works again, every station is started, and everything is sent."""
+        """Everything works again, every PC that was taken over is brought in, every station is
+        started, and everything is sent.
+        """
         for station in self.stations:
+            if not station.is_gone:
+                self.bring_in(station)
+        for station in [each for each in self.stations if not each.is_gone]:
             station.link.is_up, station.link.loses_answer = True, False
             while station._threads:
                 station.answer()

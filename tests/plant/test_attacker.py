@@ -104,10 +104,11 @@ ATTEMPTS = {
     ),
     "hide a duplicate": ("DELETE FROM plant_duplicate", DENIED),
     "claim one's own token twice": (
-        "SELECT plant_claim('{token}', 'BAT-36', 'W2605077', false, 'A', 60, '')", "23505",
+        "SELECT plant_claim('{token}', 'BAT-36', 'W2605077', false, 'A', 60, '{records}', '')",
+        "23505",
     ),
     "claim everything": (
-        "SELECT plant_claim(md5(n::text), 'BAT-36', 'X' || n, false, 'A', 60, '')"
+        "SELECT plant_claim(md5(n::text), 'BAT-36', 'X' || n, false, 'A', 60, '{records}', '')"
         " FROM generate_series(1, 1001) n", REFUSED,
     ),
     "hand a run over again": (f"SELECT plant_enqueue('mes', {_THEIRS}, 4)", DENIED),
@@ -126,13 +127,14 @@ def test_each_attempt_is_refused_and_changes_nothing(plant: Plant) -> None:
         each.send()
         each.close()
     ((theirs,),) = plant.rows("SELECT station FROM plant_station WHERE name = 'line-3'")
-    ((records,),) = plant.rows("SELECT records_id FROM plant_station WHERE name = 'line-2'")
+    query = "SELECT records_id FROM plant_station ORDER BY name"
+    (records,), (their_records,) = plant.rows(query)
     query = "SELECT hash FROM chain_row c JOIN plant_station p USING (station)"
     ((head,),) = plant.rows(query + " WHERE name = 'line-2' ORDER BY number DESC LIMIT 1")
     token = "0" * 32
     with plant.connect("flasher_line_3") as victim:
-        claim = f"SELECT plant_claim('{token}', 'BAT-36', 'W2605078', false, 'A', 60, '')"
-        victim.execute(claim.encode())
+        claim = "SELECT plant_claim(%s, 'BAT-36', 'W2605078', false, 'A', 60, %s, '')"
+        victim.execute(claim, [token, their_records])
     before = _everything(plant)
     found = {}
     with plant.connect("flasher_line_2") as attacker:

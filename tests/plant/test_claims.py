@@ -5,13 +5,15 @@ from __future__ import annotations
 import random
 from collections import Counter
 from collections.abc import Iterator
-from datetime import timedelta
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from typing import Any
 
 import pytest
 
 from flasher.plant.central import Central
-from flasher.plant.claims import LEASE_S, PlantClaims
-from flasher.plant.setup import role_of
+from flasher.plant.claims import LEASE_S, PlantClaims, _Own
+from flasher.plant.setup import role_of, setup
 from flasher.station.gate import Gate
 from flasher.station.records.errors import ClaimRefusedError, Refusal
 from flasher.station.records.model import (
@@ -21,7 +23,7 @@ from flasher.station.records.model import (
     RunId,
     RunState,
 )
-from tests.plant.claims_world import Centre, World
+from tests.plant.claims_world import Centre, Claimed, Station, World, _Claims
 from tests.plant.factory import Plant, Sender
 from tests.station.factory import HEAD, SERIAL, SERIAL_NUMBER, USUAL
 
@@ -52,34 +54,82 @@ def test_nothing_stays_claimed_after_all_runs_were_sent() -> None:
 class _ExpiredIsFree(Centre):
     """The mistake of a lock that only expires."""
 
-    def claim(self, station: str, token: str, serial: str, lease_s: float) -> str | None:
-        found = super().claim(station, token, serial, lease_s)
+    def claim(self, *asked: Any) -> str | None:
+        found = super().claim(*asked)
         return None if found == "unknown" else found
 
 
 class _GoneAtTheEnd(Centre):
     """The mistake to forget a claim when it is not renewed."""
 
-    def claim(self, station: str, token: str, serial: str, lease_s: float) -> str | None:
+    def claim(self, *asked: Any) -> str | None:
         for old, each in list(self.claims.items()):
             if each.expires_at <= self.clock.now:
                 del self.claims[old]
-        return super().claim(station, token, serial, lease_s)
+        return super().claim(*asked)
 
 
 class _RunsBeforeClaims(Centre):
     """The mistake not to look for a PASS."""
 
-    def claim(self, station: str, token: str, serial: str, lease_s: float) -> str | None:
-        found = super().claim(station, token, serial, lease_s)
+    def claim(self, *asked: Any) -> str | None:
+        found = super().claim(*asked)
         return None if found == "passed" else found
 
 
-@pytest.mark.parametrize("centre", [_ExpiredIsFree, _GoneAtTheEnd, _RunsBeforeClaims])
-def test_a_planted_mistake_is_found(centre: type[Centre]) -> None:
+class _StationIsOnePC(Centre):
+    """The mistake to take claims of a PC that was taken over for those of the PC that goes on."""
+
+    def is_own(self, claim: Claimed, station: str, takeover: str) -> bool:
+        return claim.station == station
+
+
+class _NoTakeover(Centre):
+    """The mistake to let a PC that was taken over claim units."""
+
+    def claim(self, *asked: Any) -> str | None:
+        self.takeovers.clear()
+        return super().claim(*asked)
+
+
+class _ReleasesAll(Station):
+    """The mistake to release claims of other PCs of the station, of whose runs nothing is known."""
+
+    class claims_of(_Claims):  # noqa: N801
+        def _read(self) -> _Own:
+            every = {each.takeover for each in self._of.link.centre.claims.values()}
+            return replace(super()._read(), known=frozenset(every))
+
+
+class _CountsBranches(Station):
+    """The mistake to count what was brought in, whichever PC it came from."""
+
+    class claims_of(_Claims):  # noqa: N801
+        def _read(self) -> _Own:
+            of, centre = self._of, self._of.link.centre
+            own = super()._read()
+            takeovers = int(of.takeover.partition(" ")[2] or 0) and len(centre.takeovers)
+            if len(of.brought) < takeovers:
+                return own
+            return replace(own, known=frozenset({c.takeover for c in centre.claims.values()}))
+
+
+@pytest.mark.parametrize(
+    ("centre", "station"),
+    [
+        (_ExpiredIsFree, Station),
+        (_GoneAtTheEnd, Station),
+        (_RunsBeforeClaims, Station),
+        (_StationIsOnePC, Station),
+        (_NoTakeover, Station),
+        (Centre, _ReleasesAll),
+        (Centre, _CountsBranches),
+    ],
+)
+def test_a_planted_mistake_is_found(centre: type[Centre], station: type[Station]) -> None:
     def search() -> None:
         for seed in range(SEEDS):
-            World(seed, centre).run()
+            World(seed, centre, station).run()
 
     with pytest.raises(AssertionError, match="run"):
         search()
@@ -228,6 +278,22 @@ def test_two_stations_without_the_server_both_pass_with_a_mark(
     for each in lines:
         each.sender.send()
     assert plant.rows("SELECT count(*) FROM plant_duplicate") == [(1,)]
+
+
+def test_a_station_whose_records_were_replaced_claims_nothing(
+    plant: Plant, lines: tuple[Line, Line]
+) -> None:
+    """It ran on while an administrator let new records send under its name."""
+    here, there = lines
+    here.claim()
+    setup(plant.url(), (), datetime.now(UTC), renewed=["line-2"])
+    with plant.connect(role_of("line-2")) as other:
+        other.execute("SELECT plant_enter('other records', 'line-2')")
+    assert "foreign" in here.asked("W2605005").doubt
+    doubt = "a station whose records were replaced"
+    assert doubt in refused(there).what
+    expire(plant)
+    assert there.claim().unchecked.startswith(doubt)
 
 
 def test_a_server_that_is_away_is_asked_once(lines: tuple[Line, Line]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
@@ -30,6 +31,7 @@ from flasher.station.records.model import AuditEvent, RunId, RunState, UnitState
 from flasher.station.records.signatures import SigningKey
 from tests.plant.factory import READER, Plant, Sender
 from tests.plant.test_claims import Line, expire
+from tests.plant.test_retire import MONTH_S, retired
 from tests.plant.test_verify import examined
 from tests.station.factory import FakeClock
 
@@ -255,6 +257,78 @@ def test_a_pc_that_was_taken_over_claims_nothing(plant: Plant, sender: Sender, k
     old.claims.tend()
     assert "taken-over" in old.asked("W2605003").doubt
     old.close()
+
+
+def test_a_takeover_that_was_retired_still_holds(
+    plant: Plant, sender: Sender, key: bytes, spares: list[Sender]
+) -> None:
+    old = Line(plant, "line-2", sender)
+    sender.bench.make(serial="W2605001")
+    sender.send()
+    taken(plant, key)
+    spares.append(spare := spare_of(plant, sender))
+    spare.bench.clock.go_on(MONTH_S)
+    spare.bench.make(serial="W2605002")
+    spare.send()
+    retired(plant, "2026-06")
+    assert plant.rows("SELECT count(*) FROM chain_row WHERE event = 'taken over'") == [(0,)]
+    assert "taken-over" in old.asked("W2605003").doubt
+    with pytest.raises(ChainRefusedError, match="another PC runs the station") as caught:
+        sender.send()
+    assert caught.value.refusal is Refusal.TAKEN_OVER
+    other = Line(plant, "line-2", spare)
+    assert not other.asked("W2605003").doubt
+    for each in (old, other):
+        each.claims.close()
+
+
+def test_a_pc_that_waits_for_the_unit_while_it_is_taken_over_does_not_claim_it(
+    plant: Plant, sender: Sender
+) -> None:
+    old = Line(plant, "line-2", sender)
+    old.claims.tend()
+    lock = (
+        "SELECT pg_advisory_xact_lock(hashtextextended('BAT-36' || E'\\x1f' || 'W2605002', 7053))"
+    )
+    waiting = "SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND NOT granted"
+    with ThreadPoolExecutor() as pool, plant.connect() as spare:
+        spare.execute(lock.encode())
+        asked = pool.submit(old.asked, "W2605002")
+        while plant.rows(waiting) == [(0,)]:
+            assert not asked.done()
+        spare.execute("UPDATE plant_station SET takeover = 'x' WHERE name = 'line-2'")
+        spare.commit()
+        assert "taken-over" in asked.result().doubt
+    old.claims.close()
+
+
+def test_claims_of_a_pc_stay_until_its_own_records_come(
+    plant: Plant, sender: Sender, key: bytes, spares: list[Sender]
+) -> None:
+    """Two PCs were taken over; the records of the second one come twice."""
+    first = Line(plant, "line-2", sender)
+    sender.bench.make(serial="W2605001")
+    sender.send()
+    first.end(first.claim("W2605009"))
+    taken(plant, key)
+    spares.append(second := spare_of(plant, sender))
+    second.send()
+    taken(plant, key, "third")
+    spares.append(third := spare_of(plant, sender, "third"))
+    for serial in ("W2605003", "W2605004"):
+        second.bench.make(serial=serial)
+        assert len(brought(third, second.bench.path).runs) == 1
+    line = Line(plant, "line-2", third)
+    line.claims.tend()
+    assert plant.rows("SELECT serial FROM plant_claim") == [("W2605009",)]
+    sender.bench.store.close()
+    brought(third, sender.bench.path)
+    line.start()
+    line.claims.tend()
+    third.send()
+    assert plant.rows("SELECT serial FROM plant_claim") == []
+    for each in (first, line):
+        each.claims.close()
 
 
 @pytest.mark.parametrize("sent", [1, 2, 4, 6])

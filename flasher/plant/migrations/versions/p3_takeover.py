@@ -17,5 +17,5 @@ def upgrade() -> None:
         "plant_station", sa.Column("other_refusal", sa.Text, nullable=False, server_default="")
     )
     op.add_column("plant_station", sa.Column("other_reported_at", sa.DateTime(timezone=True)))
-    for statement in (*takeover_functions.FUNCTIONS, takeover_functions.ONCE):
+    for statement in (takeover_functions.CLOSE, takeover_functions.ONCE):
         connection.exec_driver_sql(statement)
