@@ -5,9 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from enum import StrEnum
-from typing import Any, Final
+from typing import Final
 from uuid import UUID
 
 from pydantic import TypeAdapter
@@ -96,32 +95,6 @@ WHERE d.state IN {_OPEN} AND NOT EXISTS (
 """)
 """An open delivery whose job is gone gets another one."""
 _ENQUEUE: Final = text("SELECT plant_enqueue(:receiver, :station, :number)")
-_RECEIVERS: Final = text(f"""
-SELECT r.name, r.since, r.stopped_at, coalesce(d.state, '') AS state, d.amount,
-    o.oldest AS oldest_open_at
-FROM plant_receiver r
-    LEFT JOIN (SELECT receiver, state, count(*) AS amount FROM plant_delivery GROUP BY 1, 2) d
-        ON d.receiver = r.name
-    LEFT JOIN (SELECT p.receiver, min(c.arrived_at) AS oldest FROM plant_delivery p
-        JOIN chain_row c USING (station, number) WHERE p.state IN {_OPEN}
-        GROUP BY 1) o ON o.receiver = r.name
-ORDER BY r.name
-""")
-_LIST: Final = """
-SELECT d.receiver, d.station AS station_id, d.number, d.state, d.attempts, d.sent_at, d.answered_at,
-    d.answer, c.run_id, c.arrived_at, p.name AS station, u.serial, u.part, run.state AS outcome,
-    run.is_virtual, CASE WHEN j.status = 'todo' THEN j.scheduled_at END AS next_at
-FROM plant_delivery d JOIN chain_row c USING (station, number) JOIN plant_station p USING (station)
-    JOIN run ON run.id = c.run_id JOIN unit u ON u.id = run.unit_id
-    LEFT JOIN procrastinate_jobs j ON j.id = d.job
-WHERE {where} ORDER BY c.id DESC LIMIT :limit
-"""
-_CONDITIONS: Final = {
-    "receiver": "d.receiver = :receiver",
-    "state": "d.state = :state",
-    "serial": "u.serial = :serial",
-    "station_id": "d.station = :station_id AND d.number = :number",
-}
 
 
 @dataclass(frozen=True)
@@ -171,45 +144,6 @@ class RunDocument:
 
 
 _DOCUMENT: Final = TypeAdapter(RunDocument)
-
-
-@dataclass(frozen=True)
-class Delivery:
-    """A run that is handed over to a receiver."""
-
-    key: str
-    receiver: str
-    state: DeliveryState
-    attempts: int
-    sent_at: datetime | None
-    """Time of the last attempt; times are by the database's clock."""
-    answered_at: datetime | None
-    answer: str
-    """What the receiver answered then, or what failed."""
-    next_at: datetime | None
-    """Time of the next attempt; null: at once, or none."""
-    arrived_at: datetime
-    """Time at which the run arrived in the plant's database."""
-    run_id: int
-    station: str
-    serial: str
-    part: str
-    outcome: str
-    is_virtual: bool
-
-
-@dataclass(frozen=True)
-class ReceiverStatus:
-    """A receiver with its number of deliveries by state."""
-
-    name: str
-    since: datetime
-    """Runs that arrived from this time on are handed over."""
-    stopped_at: datetime | None
-    """From this time on, runs that arrive are not handed over; null: they are."""
-    counts: dict[DeliveryState, int]
-    oldest_open_at: datetime | None
-    """Arrival of the oldest run that is neither confirmed nor refused."""
 
 
 @dataclass(frozen=True)
@@ -269,29 +203,7 @@ class Deliveries:
             lost = len(connection.execute(_LOST, limits).all())
             return lost + len(connection.execute(_JOBLESS).all())
 
-    # -- what people ask --------------------------------------------------------------------------
-
-    def receivers(self) -> list[ReceiverStatus]:
-        """All receivers, by name."""
-        found: dict[str, ReceiverStatus] = {}
-        with self._central.reading() as connection:
-            for row in connection.execute(_RECEIVERS):
-                new = ReceiverStatus(row.name, row.since, row.stopped_at, {}, row.oldest_open_at)
-                status = found.setdefault(row.name, new)
-                if row.state:
-                    status.counts[DeliveryState(row.state)] = row.amount
-        return list(found.values())
-
-    def listed(self, limit: int | None, **chosen: Any) -> list[Delivery]:
-        """The newest deliveries of a filter: receiver, state, serial, key. None means any."""
-        given = {name: value for name, value in chosen.items() if value is not None}
-        if "key" in given:
-            given["station_id"], given["number"] = parse_key(given.pop("key"))
-        where = " AND ".join(_CONDITIONS[name] for name in given if name != "number") or "true"
-        with self._central.reading() as connection:
-            query = text(_LIST.format(where=where))
-            rows = connection.execute(query, {**given, "limit": limit}).mappings().all()
-        return [_delivery(dict(row)) for row in rows]
+    # -- what people do ---------------------------------------------------------------------------
 
     def document(self, key: str, schema: int) -> RunDocument:
         """The document of a run as it is sent. Raises UsageError, NotFoundError."""
@@ -342,8 +254,3 @@ def document_of(connection: Connection, station: UUID, number: int, schema: int)
     for details in details_of(connection, run.c.id == run_id):
         return RunDocument(schema, key, station, number, details)
     raise NotFoundError(f"There is no run with the key {key}.")
-
-
-def _delivery(row: dict[str, Any]) -> Delivery:
-    key = key_of(row.pop("station_id"), row.pop("number"))
-    return Delivery(**{**row, "key": key, "state": DeliveryState(row["state"])})

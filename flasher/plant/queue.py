@@ -26,6 +26,7 @@ DECLARE
     last_job bigint;
     status text;
     of_unit text;
+    of_row bigint;
 BEGIN
     SELECT job INTO last_job FROM plant_delivery d
         WHERE (d.receiver, d.station, d.number) = (to_receiver, of_station, of_number) FOR UPDATE;
@@ -36,8 +37,9 @@ BEGIN
         UPDATE procrastinate_jobs SET scheduled_at = NULL WHERE id = last_job;
         RETURN;
     END IF;
-    SELECT part || ' ' || serial INTO of_unit FROM chain_row c JOIN run ON run.id = c.run_id
-        JOIN unit ON unit.id = run.unit_id WHERE (c.station, c.number) = (of_station, of_number);
+    SELECT part || ' ' || serial, c.id INTO of_unit, of_row FROM chain_row c
+        JOIN run ON run.id = c.run_id JOIN unit ON unit.id = run.unit_id
+        WHERE (c.station, c.number) = (of_station, of_number);
     IF NOT FOUND THEN
         RETURN;
     END IF;
@@ -45,8 +47,8 @@ BEGIN
         to_receiver, '{TASK}', 0, to_receiver || ' ' || of_unit, NULL,
         jsonb_build_object('receiver', to_receiver, 'station', of_station, 'number', of_number),
         NULL)::procrastinate_job_to_defer_v1])) INTO last_job;
-    INSERT INTO plant_delivery (receiver, station, number, job)
-        VALUES (to_receiver, of_station, of_number, last_job)
+    INSERT INTO plant_delivery (receiver, station, number, job, row_id)
+        VALUES (to_receiver, of_station, of_number, last_job, of_row)
         ON CONFLICT (receiver, station, number) DO UPDATE SET job = last_job, state = 'waiting';
 END $$
 """

@@ -34,7 +34,7 @@ from sqlalchemy.dialects.postgresql import JSON
 
 from flasher.station.records import schema as station_schema
 
-PLANT_SCHEMA: Final = "8"
+PLANT_SCHEMA: Final = "9"
 """The newest Alembic revision in `migrations.versions`."""
 VERSION_TABLE: Final = "plant_version"
 STATION_TABLES: Final = tuple(
@@ -227,13 +227,20 @@ plant_delivery: Final = Table(
     Column("answered_at", DateTime(timezone=True)),
     Column("answer", Text, nullable=False, server_default=""),
     Column("job", BigInteger, nullable=False),
+    Column("row_id", BigInteger, nullable=False, server_default="0"),
     PrimaryKeyConstraint("receiver", "station", "number"),
+    Index("plant_delivery_by_row", "row_id", "receiver"),
     Index(
-        "plant_delivery_open", "state", "receiver", postgresql_where=text("state <> 'confirmed'")
+        "plant_delivery_open",
+        "state",
+        "receiver",
+        "row_id",
+        postgresql_where=text("state <> 'confirmed'"),
     ),
 )
 """A run, by its row in the station's chain, and how far its hand-over to a receiver has come.
-`sent_at` and `answer` belong to the last attempt; `job` is Procrastinate's."""
+`sent_at` and `answer` belong to the last attempt; `job` is Procrastinate's; `row_id` is the id of
+the row in `chain_row`, in the order of arrival (0: it was retired before this column came)."""
 
 plant_queue: Final = Table("plant_queue", metadata, Column("migration", Text, primary_key=True))
 """The last of Procrastinate's own migrations that its tables have."""

@@ -174,7 +174,7 @@ class SupervisorPages:
 
     def runs(self, question: Question) -> Answer:
         chosen = filter_of(question)
-        page = self.overview.runs(chosen, _cursor(question))
+        page = self.overview.runs(chosen, cursor_of(question))
         return self._page(
             question,
             "runs.html",
@@ -231,7 +231,7 @@ class SupervisorPages:
             part = parts[0] if len(parts) == 1 else ""
         if not part:
             return self._page(question, "units.html", serial=serial, parts_found=parts)
-        page = self.overview.life(serial, part, _cursor(question))
+        page = self.overview.life(serial, part, cursor_of(question))
         if not page.rows:
             raise NotFoundError(f"There is no such run of {serial}.")
         newest = self.overview.life(serial, part, PageCursor(), 1).rows[0]
@@ -299,7 +299,7 @@ class SupervisorPages:
             "images.html",
             images=images,
             chosen=chosen[0] if chosen else None,
-            page=self.overview.holders(sha256, _cursor(question)) if chosen else None,
+            page=self.overview.holders(sha256, cursor_of(question)) if chosen else None,
             count=self.overview.holder_count(sha256) if chosen else 0,
             counted_up_to=HOLDERS_COUNTED,
         )
@@ -451,10 +451,10 @@ class SupervisorPages:
 
     def audit(self, question: Question) -> Answer:
         page = self.overview.audit(
-            _cursor(question),
+            cursor_of(question),
             event=question.fields.get("event"),
-            since=_moment(question, "from"),
-            until=_moment(question, "to"),
+            since=moment_in(question, "from"),
+            until=moment_in(question, "to"),
         )
         return self._page(
             question,
@@ -557,8 +557,8 @@ def filter_of(question: Question) -> RunFilter:
     return RunFilter(
         lot=fields.get("lot"),
         recipe=fields.get("recipe"),
-        since=_moment(question, "from"),
-        until=_moment(question, "to"),
+        since=moment_in(question, "from"),
+        until=moment_in(question, "to"),
         serial=fields.get("serial"),
         part=fields.get("part"),
         search=fields.get("search"),
@@ -569,7 +569,8 @@ def filter_of(question: Question) -> RunFilter:
     )
 
 
-def _moment(question: Question, name: str) -> datetime | None:
+def moment_in(question: Question, name: str) -> datetime | None:
+    """Parse a time of a form. Raises UsageError."""
     text = question.fields.get(name)
     if text is None:
         return None
@@ -587,7 +588,7 @@ def _moment(question: Question, name: str) -> datetime | None:
 
 def _oldest(question: Question) -> PageCursor:
     """Start of a part of a file; the first part starts at the oldest row."""
-    return PageCursor(after=_cursor(question).after or 0)
+    return PageCursor(after=cursor_of(question).after or 0)
 
 
 def _part(
@@ -601,7 +602,9 @@ def _part(
     return Answer(text.encode("utf-8"), _CSV, file_name=name, after=after)
 
 
-def _cursor(question: Question) -> PageCursor:
+def cursor_of(question: Question) -> PageCursor:
+    """Parse the page of a list."""
+
     def at(name: str) -> int | None:
         text = question.fields.get(name, "")
         return int(text) if text.isascii() and text.isdigit() and len(text) < 19 else None

@@ -21,6 +21,7 @@ import pytest
 
 from flasher.errors import ExitCode
 from flasher.plant.process import Sending, sending
+from flasher.plant.schema import PLANT_SCHEMA
 from flasher.protocol.spec import BMS
 from tests.cli.conftest import Flasher
 from tests.cli.station_threads import ThreadPort
@@ -123,12 +124,13 @@ def test_tables_of_another_flasher_are_refused_with_the_next_step(
     Path("list.json").write_text("[]", "utf-8")
     receiver = '[[receiver]]\nname = "mes"\nurl = "http://127.0.0.1:1/"\n'
     Path("receivers.toml").write_text(receiver, "utf-8")
-    for found, step in (("6", "flasher plant init"), ("8", "Update flasher")):
+    of_this = int(PLANT_SCHEMA)
+    for found, step in ((of_this - 1, "flasher plant init"), (of_this + 1, "Update flasher")):
         with plant.connect() as owner:
-            owner.execute("UPDATE plant_version SET version_num = %s", [found])
+            owner.execute("UPDATE plant_version SET version_num = %s", [str(found)])
         run = flasher("plant", action, *_READING[action], "--database", plant.url())
         assert (run.code, run.out) == (ExitCode.USAGE, "")
-        assert f"has schema {found}; this flasher has schema 7" in run.err
+        assert f"has schema {found}; this flasher has schema {PLANT_SCHEMA}" in run.err
         assert "E215" in run.err
         assert step in run.err
         assert "delivers to" not in run.err
@@ -137,7 +139,7 @@ def test_tables_of_another_flasher_are_refused_with_the_next_step(
 def test_init_names_the_schemas_of_an_upgrade(flasher: Flasher, plant: Plant) -> None:
     make_old(plant, 2)
     words = ("plant", "init", "--database", plant.url())
-    assert flasher(*words).out == "upgraded the tables from schema 2 to 7\n"
+    assert flasher(*words).out == f"upgraded the tables from schema 2 to {PLANT_SCHEMA}\n"
     assert flasher(*words).out == "the tables are up to date\n"
 
 

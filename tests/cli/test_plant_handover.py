@@ -17,6 +17,7 @@ from flasher.cli.plant import handover
 from flasher.errors import ExitCode
 from flasher.plant.central import Central
 from flasher.plant.deliveries import Deliveries
+from flasher.plant.delivery_list import deliveries_of
 from tests.cli.conftest import Flasher, Run
 from tests.cli.test_schema import hold_output
 from tests.plant.conftest import plant, sender
@@ -76,12 +77,33 @@ def test_runs_are_delivered_listed_and_sent_again(desk: Desk) -> None:
     assert desk.run("deliveries", "--state", "refused").document["deliveries"] == []
 
 
+def test_all_that_the_options_choose_is_sent_again_and_listed_up_to_the_limit(desk: Desk) -> None:
+    desk.deliver()
+    for serial in ("W2605011", "W2605012", "W2605013"):
+        desk.sender.bench.make(serial=serial)
+    desk.sender.send()
+    desk.receiver.plan = iter([Act.TAKE, Act.REFUSE, Act.REFUSE]).__next__
+    desk.deliver()
+    words = ("deliveries", "--state", "refused", "--station", "line-2", "--resend", "--limit", "1")
+    url = desk.plant.url(COURIER)
+    run = desk.flasher("plant", *words, "--database", url)
+    assert "2 runs will be sent again" in run.out
+    assert "mes: 1 confirmed, 2 waiting" in run.out
+    assert [line for line in run.out.splitlines() if " to mes" in line] == [
+        "W2605013, PASS, line-2: waiting to mes"
+    ]
+    begun = ("deliveries", "--state", "waiting", "--since", "2026-05-17T00:00Z")
+    assert len(desk.run(*begun, role=READER).document["deliveries"]) == 2
+    assert desk.run(*begun, "--until", "2026-05-17T00:00Z").document["deliveries"] == []
+
+
 def test_what_is_posted_is_the_document_that_the_schema_describes(desk: Desk) -> None:
     with closing(Central(desk.plant.url(COURIER))) as central:
         Deliveries(central).register(["mes"])
         desk.sender.bench.make()
         desk.sender.send()
-        (row,) = Deliveries(central).listed(None)
+        with central.reading() as connection:
+            (row,) = deliveries_of(connection).rows
         document = as_json(Deliveries(central).document(row.key, 2))
     desk.deliver()
     assert desk.receiver.documents == {row.key: document}

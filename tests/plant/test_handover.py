@@ -9,7 +9,7 @@ import json
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from typing import Any
 
@@ -20,7 +20,8 @@ from flasher.errors import UsageError
 from flasher.plant import courier
 from flasher.plant.central import Central
 from flasher.plant.courier import Courier
-from flasher.plant.deliveries import Answer, Attempt, Deliveries, Delivery, DeliveryState, parse_key
+from flasher.plant.deliveries import Answer, Attempt, Deliveries, DeliveryState, parse_key
+from flasher.plant.delivery_list import Delivery, deliveries_of, receivers_of
 from flasher.plant.receivers import Receiver as Settings
 from flasher.plant.transport import transport_to
 from flasher.station.records.errors import NotFoundError, RecordError
@@ -73,8 +74,12 @@ class Desk:
             )
 
     def only(self) -> Delivery:
-        (found,) = self.deliveries.listed(None)
+        (found,) = self.listed()
         return found
+
+    def listed(self) -> Sequence[Delivery]:
+        with self.central.reading() as connection:
+            return deliveries_of(connection).rows
 
 
 @pytest.fixture
@@ -112,11 +117,11 @@ def test_runs_before_the_receiver_was_named_are_not_sent(desk: Desk) -> None:
     desk.sender.bench.make()
     desk.deliveries.stop("mes")
     desk.sender.send()
-    assert desk.deliveries.listed(None) == []
+    assert not desk.listed()
     desk.deliveries.register(["mes"])
     desk.sender.bench.make(serial=OTHER)
     desk.sender.send()
-    assert [each.serial for each in desk.deliveries.listed(None)] == [OTHER]
+    assert [each.serial for each in desk.listed()] == [OTHER]
 
 
 def test_a_batch_that_is_not_committed_leaves_no_job(desk: Desk) -> None:
@@ -318,7 +323,8 @@ def test_two_receivers_do_not_wait_for_each_other(desk: Desk) -> None:
     desk.receiver.plan = iter([Act.HANG, Act.TAKE]).__next__
     desk.deliver(name="slow", time_limit_s=0.5)
     desk.deliver()
-    found = {each.name: each.counts for each in desk.deliveries.receivers()}
+    with desk.central.reading() as connection:
+        found = {each.name: each.counts for each in receivers_of(connection)}
     assert found == {"mes": {DeliveryState.CONFIRMED: 1}, "slow": {DeliveryState.UNKNOWN: 1}}
 
 

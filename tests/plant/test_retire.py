@@ -19,6 +19,7 @@ from flasher.plant.archive import month_after
 from flasher.plant.archive_check import ArchiveExaminer
 from flasher.plant.central import Central
 from flasher.plant.deliveries import Answer, Deliveries, DeliveryState, parse_key
+from flasher.plant.delivery_list import DeliveryFilter, deliveries_of
 from flasher.plant.retire import ArchiveRefusedError, RetiredMonth, Retirement, month_before
 from flasher.plant.store import PlantStore
 from flasher.plant.verify import PlantExamination, PlantExaminer
@@ -124,9 +125,8 @@ def test_a_month_that_is_not_handed_over_stays(plant: Plant, sender: Sender) -> 
             retired(plant, "2026-06")
         assert counts(plant) == before
         assert not (plant.folder / "archive").exists()
-        (oldest,) = [
-            each for each in deliveries.listed(None, receiver="mes") if each.serial != "W2605003"
-        ]
+        with central.reading() as connection:
+            (oldest,) = deliveries_of(connection, DeliveryFilter("mes", serial="W2605002")).rows
         attempt = deliveries.begin("mes", *parse_key(oldest.key), 1)
         assert attempt is not None
         deliveries.end(attempt, Answer(DeliveryState.CONFIRMED, "200"))

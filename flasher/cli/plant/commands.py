@@ -340,14 +340,35 @@ def deliver(output: Output, receivers: Path, database: str, *, once: bool) -> in
     return _call("handover.deliver", output, database, receivers, once=once)
 
 
+@dataclass(frozen=True)
+class DeliveryOptions:
+    """Options: which deliveries, as in `flasher.plant.delivery_list.DeliveryFilter`."""
+
+    receiver: Annotated[str | None, option(
+        "--receiver", metavar="NAME", brief=True, help="only to this receiver",
+    )]  # fmt: skip
+    state: Annotated[str | None, option(
+        "--state", type=click.Choice(("waiting", "sent", "confirmed", "unknown", "refused")),
+        brief=True, help="only in this state",
+    )]  # fmt: skip
+    station: Annotated[str | None, option(
+        "--station", metavar="NAME", help="only runs of this station",
+    )]  # fmt: skip
+    serial: Annotated[str | None, option("--serial", metavar="SERIAL", help="only of this unit")]
+    since: Annotated[str | None, option(
+        "--since", metavar="TIME",
+        help="only runs that arrived at this time or later: 2026-05-17, or 2026-05-17T06:00",
+    )]  # fmt: skip
+    until: Annotated[str | None, option(
+        "--until", metavar="TIME", help="only runs that arrived before this time",
+    )]  # fmt: skip
+    key: Annotated[str | None, option(
+        "--key", metavar="KEY", help="only the run with this key; --json contains its document",
+    )]  # fmt: skip
+
+
 @plant.action("deliveries")
-@option("--receiver", metavar="NAME", brief=True, help="only to this receiver")
-@option(
-    "--state", type=click.Choice(("waiting", "sent", "confirmed", "unknown", "refused")),
-    brief=True, help="only in this state",
-)  # fmt: skip
-@option("--serial", metavar="SERIAL", help="only of this unit")
-@option("--key", metavar="KEY", help="only the run with this key; --json contains its document")
+@option_set("options", DeliveryOptions)
 @option(
     "--limit", type=values.count, default="20", metavar="N",
     help="list at most N, the newest (default 20)",
@@ -363,10 +384,7 @@ def deliver(output: Output, receivers: Path, database: str, *, once: bool) -> in
 @_database_option
 def deliveries(
     output: Output,
-    receiver: str | None,
-    state: str | None,
-    serial: str | None,
-    key: str | None,
+    options: DeliveryOptions,
     limit: int,
     stop: str | None,
     database: str,
@@ -374,8 +392,7 @@ def deliveries(
     resend: bool,
 ) -> int:
     """List what was handed over to the plant's systems, and what they answered."""
-    chosen = {"receiver": receiver, "state": state, "serial": serial, "key": key}
-    return _call("handover.deliveries", output, database, chosen, limit, resend=resend, stop=stop)
+    return _call("handover.deliveries", output, database, options, limit, resend=resend, stop=stop)
 
 
 @plant.action("reconcile")

@@ -8,7 +8,8 @@ from typing import Final
 from flasher.cli.station.documents import StationReportDocument
 from flasher.plant.activity import Activity
 from flasher.plant.alerts import StationCheck
-from flasher.plant.deliveries import Delivery, DeliveryState, ReceiverStatus, RunDocument
+from flasher.plant.deliveries import DeliveryState, RunDocument
+from flasher.plant.delivery_list import Delivery, ReceiverStatus
 from flasher.plant.fetcher import Fetched
 from flasher.plant.forwarder import ForwarderState
 from flasher.plant.recipes import RecipeEvent

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Final
@@ -11,7 +11,9 @@ from typing import Final
 from flasher.cli.documents import SCHEMA_VERSION
 from flasher.cli.extras import need
 from flasher.cli.output import Output, counted
+from flasher.cli.plant.commands import DeliveryOptions
 from flasher.cli.plant.documents import PlantDeliverDocument, PlantDeliveriesDocument
+from flasher.cli.station.records import moment_of
 from flasher.cli.stop import stop_on_signal
 from flasher.errors import ExitCode, UsageError
 from flasher.plant.central import open_central
@@ -19,10 +21,15 @@ from flasher.plant.deliveries import (
     Answer,
     Attempt,
     Deliveries,
-    Delivery,
     DeliveryState,
-    ReceiverStatus,
     unknown_receiver,
+)
+from flasher.plant.delivery_list import (
+    Delivery,
+    DeliveryFilter,
+    ReceiverStatus,
+    deliveries_of,
+    receivers_of,
 )
 from flasher.plant.receivers import load_receivers
 from flasher.plant.reconcile import Reconciliation, compare, read_list
@@ -60,38 +67,51 @@ def deliver(output: Output, url: str, file: Path, *, once: bool) -> int:
 def deliveries(
     output: Output,
     url: str,
-    chosen: Mapping[str, str | None],
+    options: DeliveryOptions,
     limit: int,
     *,
     resend: bool,
     stop: str | None,
 ) -> int:
-    key, receiver = chosen["key"], chosen["receiver"]
-    has_filter = any(value is not None for value in chosen.values())
-    if resend and not has_filter:
+    if resend and not any(vars(options).values()):
         raise UsageError(
             "--resend would send every run again.",
             remedy="Choose which: --state refused, --serial SERIAL, --key KEY or --receiver NAME.",
         )
+    chosen = DeliveryFilter(
+        receiver=options.receiver,
+        state=None if options.state is None else DeliveryState(options.state),
+        station=options.station,
+        serial=options.serial,
+        key=options.key,
+        since=moment_of(options.since, "--since"),
+        until=moment_of(options.until, "--until"),
+    )
     with open_central(url) as central:
         found = Deliveries(central)
         if stop is not None:
             found.stop(stop)
             output.progress(printable(f"{stop} gets no run that arrives from now on"))
-        receivers = found.receivers()
-        if receiver is not None and receiver not in {each.name for each in receivers}:
-            raise unknown_receiver(receiver)
-        rows = found.listed(None if resend else limit, **chosen)
+        with central.reading() as connection:
+            known = receivers_of(connection)
+            if chosen.receiver not in {None, *(each.name for each in known)}:
+                raise unknown_receiver(str(chosen.receiver))
+            size = None if resend else limit
+            # Without a receiver there may be no queue to read.
+            rows = deliveries_of(connection, chosen, size=size).rows if known else ()
         if resend:
             for name in dict.fromkeys(row.receiver for row in rows):
                 found.send_again(name, [row.key for row in reversed(rows) if row.receiver == name])
-            rows = found.listed(None, **{**chosen, "state": None})[:limit]
-        document = found.document(key, SCHEMA_VERSION) if key is not None and rows else None
-    output.results(_receiver_lines(receivers))
+            output.result(f"{counted(len(rows), 'run')} will be sent again")
+            with central.reading() as connection:
+                known = receivers_of(connection)
+                again = [DeliveryFilter(row.receiver, key=row.key) for row in rows[:limit]]
+                rows = tuple(row for each in again for row in deliveries_of(connection, each).rows)
+        has_document = chosen.key is not None and rows
+        document = found.document(str(chosen.key), SCHEMA_VERSION) if has_document else None
+    output.results(_receiver_lines(known))
     output.results(printable(line) for row in rows for line in _lines(row))
-    if resend:
-        output.result(f"{counted(len(rows), 'run')} will be sent again")
-    return output.document(PlantDeliveriesDocument(receivers, rows, document))
+    return output.document(PlantDeliveriesDocument(known, list(rows), document))
 
 
 def _receiver_lines(receivers: list[ReceiverStatus]) -> Iterator[str]:
@@ -122,7 +142,9 @@ def reconcile(output: Output, url: str, receiver: str, file: Path, *, resend: bo
     listed = read_list(file)
     with open_central(url) as central:
         found = Deliveries(central)
-        if receiver not in {each.name for each in found.receivers()}:
+        with central.reading() as connection:
+            known = {each.name for each in receivers_of(connection)}
+        if receiver not in known:
             raise unknown_receiver(receiver)
         result = compare(receiver, listed, found.keys(receiver))
         retired = found.send_again(receiver, result.missing) if resend else []

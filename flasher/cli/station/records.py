@@ -69,8 +69,8 @@ def report(
     chosen = RunFilter(
         lot=options.lot,
         recipe=options.recipe,
-        since=_moment(options.since, "--since"),
-        until=_moment(options.until, "--until"),
+        since=moment_of(options.since, "--since"),
+        until=moment_of(options.until, "--until"),
         serial=options.serial,
         part=options.part,
         station=options.station,
@@ -116,7 +116,7 @@ def _check_station(store: Store, station: str | None) -> None:
         )
 
 
-def _moment(text: str | None, option: str) -> datetime | None:
+def moment_of(text: str | None, option: str) -> datetime | None:
     """Parse a time; it is local without a time zone. Raises UsageError."""
     if text is None:
         return None

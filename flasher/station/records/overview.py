@@ -407,15 +407,24 @@ class Overview:
         has_more = len(rows) > size
         rows = rows[:size]
         ids = [row.pop("cursor_id") for row in rows]
-        has_older, has_newer = has_more, cursor.before is not None
-        if cursor.after is not None:
-            rows, ids = rows[::-1], ids[::-1]
-            has_older, has_newer = True, has_more
-        return Page(
-            rows_of.validate_python(rows),
-            PageCursor(before=ids[-1]) if ids and has_older else None,
-            PageCursor(after=ids[0]) if ids and has_newer else None,
-        )
+        return page_of(rows_of.validate_python(rows), ids, cursor, has_more=has_more)
+
+
+def page_of(
+    rows: Sequence[_Row], ids: Sequence[int], cursor: PageCursor, *, has_more: bool
+) -> Page[_Row]:
+    """Page of rows with these ids, which are in the order of `PageCursor.of`. `has_more`: the
+    query found more of them.
+    """
+    has_older, has_newer = has_more, cursor.before is not None
+    if cursor.after is not None:
+        rows, ids = rows[::-1], ids[::-1]
+        has_older, has_newer = True, has_more
+    return Page(
+        tuple(rows),
+        PageCursor(before=ids[-1]) if ids and has_older else None,
+        PageCursor(after=ids[0]) if ids and has_newer else None,
+    )
 
 
 def _group_of(
