@@ -571,7 +571,7 @@ class Procedures:
                     "Interrupted while the adapter was away.",
                     where=lost.where,
                     cause=lost.what,
-                    remedy="Plug the adapter in, then run the same command again.",
+                    remedy=f"Plug the adapter in. {AGAIN}",
                 ) from lost
             try:
                 self.link.reopen()

@@ -405,7 +405,7 @@ class CanLink:
             what,
             where=str(self),
             cause="it was unplugged, its interface went down, or the bus is off",
-            remedy="Check the adapter and the wiring, then run the same command again.",
+            remedy="Check the adapter and the wiring. Run the same command again.",
             code=ErrorCode.ADAPTER_LOST,
         )
 

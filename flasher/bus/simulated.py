@@ -432,6 +432,6 @@ class SimulatedLink:
             f"The adapter failed while {doing}: no such device.",
             where=str(self),
             cause="it was unplugged",
-            remedy="Plug it in, then run the same command again.",
+            remedy="Plug it in. Run the same command again.",
             code=ErrorCode.ADAPTER_LOST,
         )

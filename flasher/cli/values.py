@@ -50,7 +50,7 @@ def address(text: str) -> int:
     """Parse an address in hexadecimal, with 0x: without it, another address would be meant."""
     if _ADDRESS.fullmatch(text):
         return int(text, 16)
-    hint = f"; did you mean 0x{text}?" if re.fullmatch(r"[0-9a-fA-F]{1,8}", text) else ""
+    hint = f", such as 0x{text}" if re.fullmatch(r"[0-9a-fA-F]{1,8}", text) else ""
     raise click.BadParameter(f"{text!a} is not an address in hexadecimal with 0x{hint}")
 
 

@@ -40,7 +40,7 @@ from flasher.host.identity import (
 )
 from flasher.host.outcome import AGAIN
 from flasher.host.query import memory_bytes
-from flasher.i18n import text, with_value
+from flasher.i18n import Text, text, with_value
 from flasher.image.image import Image
 from flasher.image.sample import is_sample, sample_error
 from flasher.kept_settings import settings_of
@@ -710,7 +710,7 @@ class BenchController:
             )
         if carried.error is not None:
             again = RESCUE if carried.error.needs_rescue else _AGAIN
-            carried.error.remedy = with_value(carried.error.remedy, AGAIN, again)
+            advise(carried.error, again, AGAIN)
         state = self.state
         before = None if state.is_rescue else state.bike  # a bootloader does not report its unit
         done = Done(
@@ -817,6 +817,14 @@ def _note_of(event: object) -> str:
     line = progress_line(event)
     warning = warning_text(event) or (line[0] if line and line[1] < 2 else "")
     return "" if isinstance(event, events.CheckMade) else warning
+
+
+def advise(error: FlasherError, advice: str, instead_of: str) -> None:
+    """Replace a sentence of what an error advises."""
+    if isinstance(error.remedy, Text):
+        error.remedy = with_value(error.remedy, instead_of, advice)
+    else:
+        error.remedy = error.remedy.replace(instead_of, advice)
 
 
 def changed_error(offer: Offer) -> ImageError:

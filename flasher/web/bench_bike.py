@@ -13,9 +13,9 @@ from flasher.bike import (
     serial_number,
 )
 from flasher.errors import InterruptedByUserError
-from flasher.i18n import text, with_value
+from flasher.i18n import text
 from flasher.protocol.spec import BMS, Target
-from flasher.web.bench import RESCUE, BenchController, changed_error
+from flasher.web.bench import RESCUE, BenchController, advise, changed_error
 from flasher.web.bench_state import Activity, Offer, SetDevice
 
 _GO_ON: Final = text("Go on with the bike.")
@@ -67,7 +67,7 @@ def upgrade_bike(bench: BenchController, selection: str) -> None:
                     _ended(bench)
                 if done.error is not None:
                     if not done.is_refused:
-                        done.error.remedy = with_value(done.error.remedy, RESCUE, _GO_ON)
+                        advise(done.error, _GO_ON, RESCUE)
                     return
     finally:
         bench.show(target=None, offer=chosen)

@@ -210,8 +210,10 @@ class VirtualBike:
                 device = self._devices.get(job.plan.target)
                 if device is not None:
                     device.set(PowerCut(_HAND_S), AtTime(self._clock.now() + _HAND_S))
-            case events.PacketAcknowledged(number, total, _) if number == total // 2:
+            case events.PacketAcknowledged(number, total, _) if (
+                number == total // 2 and job is not None and not job.options.at_power_up
+            ):
                 if self._fault is BikeFault.PULLED:
                     self._bus.unplug()
-                elif self._fault is BikeFault.SECOND_TOOL and job is not None:
+                elif self._fault is BikeFault.SECOND_TOOL:
                     self._bus.link().send(Frame(job.plan.target.request_id, _FOREIGN))

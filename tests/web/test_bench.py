@@ -388,8 +388,13 @@ def test_a_bad_end_says_what_happened_and_claims_no_more_than_is_known(
     assert done.error is not None
     assert done.error.needs_rescue
     assert "State of the device:" in done.error.remedy
+    assert "command" not in done.error.remedy
     assert done.bundle is not None
     assert done.bundle.is_dir()
+    if fault is not BikeFault.REFUSES:
+        rescued = place.do(BenchController.rescue_it, lambda bench: _upgrade(bench.state)(bench))
+        assert rescued.done is not None
+        assert rescued.done.error is None, "the fault is over"
 
 
 def test_a_bootloader_that_announces_itself_instead_runs_no_new_version(place: BenchPlace) -> None:
