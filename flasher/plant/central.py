@@ -24,6 +24,12 @@ _NAME_ONE: Final = (
 )
 
 
+_OWNS: Final = text(
+    "SELECT pg_has_role(current_user, relowner, 'USAGE'), pg_get_userbyid(relowner)"
+    " FROM pg_class WHERE oid = 'chain_row'::regclass"
+)
+
+
 class Refusal(StrEnum):
     """Why the plant refuses a station's chain."""
 
@@ -124,6 +130,17 @@ class Central:
                 cause="an older flasher made its tables",
                 remedy="The owner of the database runs flasher plant init --database URL, which"
                 " upgrades them.",
+            )
+
+    def check_owner(self, what: str) -> None:
+        """Check that this user owns the tables. `what` only the owner may do. Raises UsageError."""
+        with self.reading() as connection:
+            is_owner, owner = connection.execute(_OWNS).one()
+        if not is_owner:
+            raise UsageError(
+                f"Only the owner of the plant's database may {what}.",
+                where=self.shown,
+                remedy=f"Use the user {printable(owner)}.",
             )
 
     @contextmanager

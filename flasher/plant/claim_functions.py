@@ -4,7 +4,8 @@
 A claim stays until its station sends the end of the run, or releases it because no run began. It
 expires if its station does not renew it; from then on it refuses the unit nowhere, but the station
 may have passed the unit, which `plant_claim` states. So a unit is reported as free only while no
-run of it at another station can end with a PASS that is not here.
+run of it at another station can end with a PASS that is not here. The owner of the database can
+release an expired claim; a run with it that arrives later is marked (`claim_list`).
 
 A PC that was taken over may have passed units that it never sent: to the PC that continues the
 station its claims are those of another station, and it can claim nothing.
@@ -122,11 +123,16 @@ _END: Final = f"""
 CREATE OR REPLACE FUNCTION plant_end_claims() RETURNS trigger LANGUAGE plpgsql {DEFINER} AS $$
 DECLARE
     ended run;
+    of_token text;
 BEGIN
-    DELETE FROM plant_claim WHERE station = NEW.station AND token IN (
-        SELECT m.text FROM step s JOIN measurement m ON m.step_id = s.id
+    SELECT m.text INTO of_token FROM step s JOIN measurement m ON m.step_id = s.id
         WHERE s.run_id = NEW.run_id AND s.position = 1 AND s.name = '{StepName.PLANT}'
-            AND m.name = '{PLANT_CLAIM}');
+            AND m.name = '{PLANT_CLAIM}';
+    IF FOUND THEN
+        DELETE FROM plant_claim WHERE station = NEW.station AND token = of_token;
+        UPDATE released_claim SET run_id = NEW.run_id
+            WHERE station = NEW.station AND token = of_token;
+    END IF;
     SELECT * INTO ended FROM run WHERE id = NEW.run_id;
     IF ended.state = 'PASS' AND ended.kind IN ('{RunKind.PRODUCTION}', '{RunKind.RECHECK}') THEN
         INSERT INTO plant_pass (unit_id, is_virtual, run_id, station)

@@ -103,22 +103,12 @@ class Retirement:
         self._central, self._database = central, database
         self._folder, self._progress = folder, progress
         self._done = self._total = 0
-        owns = text(
-            "SELECT pg_has_role(current_user, relowner, 'USAGE'), pg_get_userbyid(relowner)"
-            " FROM pg_class WHERE oid = 'chain_row'::regclass"
-        )
         # What another version keeps beside a run would be left, or be lost.
         central.check_schema()
+        central.check_owner("retire records")
         with central.reading() as connection:
-            is_owner, owner = connection.execute(owns).one()
             self._plant = str(
                 connection.execute(select(schema.schema_info.c.records_id)).scalar_one()
-            )
-        if not is_owner:
-            raise UsageError(
-                "Only the owner of the plant's database may retire records.",
-                where=central.shown,
-                remedy=f"Use the user {printable(owner)}.",
             )
 
     def months(self, before: str) -> list[DueMonth]:

@@ -34,7 +34,7 @@ from sqlalchemy.dialects.postgresql import JSON
 
 from flasher.station.records import schema as station_schema
 
-PLANT_SCHEMA: Final = "9"
+PLANT_SCHEMA: Final = "10"
 """The newest Alembic revision in `migrations.versions`."""
 VERSION_TABLE: Final = "plant_version"
 STATION_TABLES: Final = tuple(
@@ -145,6 +145,28 @@ plant_claim: Final = Table(
 )
 """Claims of units by stations whose run has not arrived (`claim_functions`). `takeover` is the hash
 of the audit row with which the claiming PC took the station over."""
+
+released_claim: Final = Table(
+    "released_claim",
+    metadata,
+    Column("token", Text, primary_key=True),
+    Column("station", Uuid, nullable=False),
+    Column("part", Text, nullable=False),
+    Column("serial", Text, nullable=False),
+    Column("socket", Text, nullable=False),
+    Column("claimed_at", DateTime(timezone=True), nullable=False),
+    Column("reason", Text, nullable=False),
+    Column(
+        "released_at",
+        DateTime(timezone=True),
+        nullable=False,
+        server_default=func.clock_timestamp(),
+    ),
+    Column("released_by", Text, nullable=False, server_default=text("session_user")),
+    Column("run_id", BigInteger),
+)
+"""Claims that the owner of the database released, since their station does not return. `run_id` is
+the run, if it arrived after all: it counts as one whose duplicates were not checked."""
 
 plant_pass: Final = Table(
     "plant_pass",

@@ -6,7 +6,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final, NoReturn
@@ -18,6 +18,7 @@ from sqlalchemy import Connection, func, select, text
 from flasher.errors import UsageError
 from flasher.plant.archive import month_after
 from flasher.plant.central import open_central, plant_location
+from flasher.plant.claim_list import RELEASED_MARK, released_runs
 from flasher.plant.schema import SHARED_PARTS, archive_file, shared_part, trace
 from flasher.station.records.database import Database, Location, locate, open_database
 from flasher.station.records.errors import RecordsDamagedError
@@ -28,7 +29,9 @@ from flasher.station.records.model import (
     DUPLICATES,
     PassedRun,
     PassedTwice,
+    ReportedRun,
     RunExamination,
+    RunFilter,
     RunId,
     StationClock,
     StepName,
@@ -39,6 +42,7 @@ from flasher.station.records.rows import batches
 from flasher.station.records.store import Store
 
 _USUAL: Final = KeyLocations()
+_EVERYTHING: Final = RunFilter()
 
 
 def cache_folder(url: str) -> Path:
@@ -50,15 +54,18 @@ def cache_folder(url: str) -> Path:
 
 _ONE: Final = """
     {of}.id AS {of}_run_id, {of}_station.name AS {of}_station, {of}_socket.name AS {of}_socket,
-    {of}.begun_at AS {of}_begun_at, (SELECT m.text FROM step s JOIN measurement m
-        ON m.step_id = s.id WHERE s.run_id = {of}.id AND s.position = 1 AND s.name = '{step}'
-        AND m.name = '{measured}') AS {of}_duplicates
+    {of}.begun_at AS {of}_begun_at, coalesce(
+        (SELECT '{released}' FROM released_claim c WHERE c.run_id = {of}.id),
+        (SELECT m.text FROM step s JOIN measurement m ON m.step_id = s.id WHERE s.run_id = {of}.id
+            AND s.position = 1 AND s.name = '{step}' AND m.name = '{measured}')) AS {of}_duplicates
 """
 _OF: Final = """
     JOIN run {of} ON {of}.id = d.{key} JOIN socket {of}_socket ON {of}_socket.id = {of}.socket_id
     JOIN station {of}_station ON {of}_station.id = {of}_socket.station_id
 """
-_NAMES: Final = {"step": StepName.PLANT.value, "measured": DUPLICATES}
+_NAMES: Final = {
+    "step": StepName.PLANT.value, "measured": DUPLICATES, "released": RELEASED_MARK,
+}  # fmt: skip
 _TWICE: Final = text(
     f"SELECT unit.serial, unit.part, second.is_virtual, {_ONE.format(of='first', **_NAMES)},"
     f" {_ONE.format(of='second', **_NAMES)} FROM plant_duplicate d"
@@ -127,6 +134,15 @@ class PlantFiles(FileStore):
 
 class PlantRecords(Records):
     """Queries of a plant's database. Certificates are a matter of the stations."""
+
+    def table(self, chosen: RunFilter = _EVERYTHING) -> list[ReportedRun]:
+        """The runs of a filter, with the mark of those whose claim was released."""
+        with self._database.reading() as connection:
+            released = released_runs(connection)
+        return [
+            replace(run, duplicates=RELEASED_MARK) if run.run_id in released else run
+            for run in super().table(chosen)
+        ]
 
     def head_of(self, run_id: RunId) -> ChainHead | None:
         _refuse_certificate()

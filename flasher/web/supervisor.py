@@ -162,6 +162,10 @@ class SupervisorPages:
     def _trouble(self, question: Question, status: int, error: FlasherError) -> Answer:
         return self._page(question, "trouble.html", http=status, error=error, path="")
 
+    def released(self) -> Mapping[int, str]:
+        """Marks of a plant's runs that arrived after the claim of their unit was released."""
+        return {}
+
     def _page(
         self, question: Question, template: str, *, http: int = 200, **context: Any
     ) -> Answer:
@@ -181,6 +185,7 @@ class SupervisorPages:
             page=page,
             codes=list(codes.CODES),
             **self._choices(),
+            released=self.released(),
             passed_twice=self.store.passed_twice(_TWICE_MAX),
             warning=Status.WARNING,
         )
@@ -189,7 +194,11 @@ class SupervisorPages:
         media_type, make = _FILES[question.path]
         if make is Report.to_csv:
             page = self.overview.rows(filter_of(question), _oldest(question), PART_SIZE)
-            rows = [row.values() for row in page.rows[::-1]]
+            marks = self.released()
+            rows = [
+                (row | {"duplicates": marks.get(row["run_id"], row["duplicates"])}).values()
+                for row in page.rows[::-1]
+            ]
             return _part(question, page, page.rows[0] if page.rows else (), rows)
         report = Report(self.store.read, filter_of(question))
         name = question.path.lstrip("/")
@@ -249,6 +258,7 @@ class SupervisorPages:
             is_over=newest.run.state is not RunState.RUNNING,
             page=page,
             shown=shown,
+            released=self.released(),
             story=story if isinstance(story, Story) else None,
             no_story=story if isinstance(story, str) else "",
             drawn=None

@@ -110,6 +110,7 @@ _READING: dict[str, tuple[str, ...]] = {
     "recipes": (),
     "withdraw": ("0123", "--reason", "x"),
     "deliveries": (),
+    "claims": (),
     "reconcile": ("list.json", "--receiver", "mes"),
     "deliver": ("--receivers", "receivers.toml", "--once"),
     "retire": ("--archive", "archive", "--before", "2026-06"),
@@ -569,6 +570,42 @@ def test_status_lists_units_that_passed_twice(
     for action in ("status", "report"):
         shown = flasher("plant", action, "--database", plant.url()).out
         assert "passed at two stations: 1 unit" in shown
+
+
+def test_expired_claims_are_released_for_a_reason(
+    flasher: Flasher, plant: Plant, sender: Sender
+) -> None:
+    sender.send()
+    claim = (
+        "INSERT INTO plant_claim (token, station, part, serial, socket, claimed_at, expires_at)"
+        " SELECT '{0}', station, 'BAT-36', '{0}', 'A', now(), now() + interval '{1}'"
+        " FROM plant_station WHERE name = 'line-2'"
+    )
+    with plant.connect() as owner:
+        for serial, left in (("W2605011", "-1 min"), ("W2605012", "1 min")):
+            owner.execute(claim.format(serial, left).encode())
+    words = ("plant", "claims", "--database", plant.url())
+    for mistake in (("--release",), ("--reason", "x"), ("--release", "--reason", "x")):
+        run = flasher(*words, *mistake)
+        assert run.code == ExitCode.USAGE
+        assert "--release" in run.err
+    before = flasher(*words).out
+    assert [line.split(", ")[0] for line in before.splitlines()] == [
+        "BAT-36 W2605011", "BAT-36 W2605012",
+    ]  # fmt: skip
+    assert before.count("EXPIRED") == 1
+    run = flasher(
+        *words, "--station", "line-2", "--release", "--reason", "its disk\tbroke", "--json"
+    )
+    hold_output(json.loads(SCHEMA.read_text("utf-8")), run.out, run.code)
+    (left,), (old,) = run.document["claims"], run.document["released"]
+    assert (left["serial"], old["serial"]) == ("W2605012", "W2605011")
+    lines = flasher(*words).out.splitlines()
+    assert lines[0].startswith("BAT-36 W2605012, line-2, socket A, claimed")
+    assert lines[1].endswith(" by postgres: its disk\\tbroke")
+    again = flasher(*words, "--serial", "W2605012", "--release", "--reason", "impatient")
+    assert again.code == ExitCode.USAGE
+    assert "nothing was released" in again.err
 
 
 def test_retire_moves_months_to_files_that_verify_examines(

@@ -75,6 +75,12 @@ ATTEMPTS = {
     "store another trace under a hash": (
         f"INSERT INTO trace VALUES ({_HASH}, 'x')", "23514",
     ),
+    "read released claims": ("SELECT * FROM released_claim", DENIED),
+    "undo the release of a claim": ("DELETE FROM released_claim", DENIED),
+    "release the claim of another station": (
+        "INSERT INTO released_claim (token, station, part, serial, socket, claimed_at, reason)"
+        f" VALUES ('x', {_THEIRS}, '', '', '', now(), '')", DENIED,
+    ),
     "publish a recipe": ("INSERT INTO released_recipe VALUES ('x', 'x', '', '', '')", DENIED),
     "store an image": (f"INSERT INTO released_file VALUES ({_HASH}, 'x')", DENIED),
     "give a recipe to all stations": (

@@ -5,27 +5,43 @@ from __future__ import annotations
 import random
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import pytest
 
+from flasher.errors import UsageError
 from flasher.plant.central import Central
+from flasher.plant.claim_list import (
+    RELEASED_MARK,
+    ClaimFilter,
+    claims_of,
+    release,
+    releases_of,
+)
 from flasher.plant.claims import LEASE_S, PlantClaims, _Own
 from flasher.plant.setup import role_of, setup
+from flasher.plant.store import PlantStore
 from flasher.station.gate import Gate
 from flasher.station.records.errors import ClaimRefusedError, Refusal
 from flasher.station.records.model import (
+    CHECKED,
     Admission,
     Claim,
     Order,
     RunId,
     RunState,
 )
+from flasher.web.plant import PlantPages
+from flasher.web.query_processes import Question
+from flasher.web.supervisor import open_supervisor
 from tests.plant.claims_world import Centre, Claimed, Station, World, _Claims
-from tests.plant.factory import Plant, Sender
+from tests.plant.factory import COURIER, READER, Plant, Sender
 from tests.station.factory import HEAD, SERIAL, SERIAL_NUMBER, USUAL
+from tests.station.postgres import OWNER
 
 SEEDS = 1500
 
@@ -77,6 +93,14 @@ class _RunsBeforeClaims(Centre):
         return None if found == "passed" else found
 
 
+class _ReleasedIsForgotten(Centre):
+    """The mistake not to mark a run that arrives after its claim was released."""
+
+    def release_expired(self) -> None:
+        super().release_expired()
+        self.released.clear()
+
+
 class _StationIsOnePC(Centre):
     """The mistake to take claims of a PC that was taken over for those of the PC that goes on."""
 
@@ -122,6 +146,7 @@ class _CountsBranches(Station):
         (_RunsBeforeClaims, Station),
         (_StationIsOnePC, Station),
         (_NoTakeover, Station),
+        (_ReleasedIsForgotten, Station),
         (Centre, _ReleasesAll),
         (Centre, _CountsBranches),
     ],
@@ -420,3 +445,98 @@ def test_the_model_of_the_virtual_stations_answers_like_postgresql(
         for line, (claim, _) in open_runs.items():
             line.end(claim, RunState.FAIL)
             line.sender.send()
+
+
+# -- a station that does not return ----------------------------------------------------------------
+
+
+def released(plant: Plant, **chosen: str) -> int:
+    with closing(Central(plant.url())) as central:
+        return release(central, ClaimFilter(**chosen), "its disk is broken")
+
+
+def test_a_run_that_arrives_after_its_claim_was_released_is_marked(
+    plant: Plant, lines: tuple[Line, Line]
+) -> None:
+    gone, other = lines
+    run = gone.end(gone.claim())
+    expire(plant)
+    doubt = other.asked()
+    assert doubt.elsewhere is not None, "its station may have passed it"
+    other.gate.dropped(doubt)
+    other.claims.tend()
+    assert released(plant, station="line-2", serial=SERIAL) == 1
+    claim = other.claim()
+    assert claim.unchecked == ""
+    other.end(claim)
+    other.sender.send()
+    with closing(plant.store()) as store:
+        (first,) = store.read.table()
+        gone.sender.send()
+        runs = {each.station: each for each in store.read.table()}
+        (twice,) = store.passed_twice(100)
+    assert (first.duplicates, runs["line-3"].duplicates) == (CHECKED, CHECKED)
+    assert runs["line-2"].duplicates == twice.second.duplicates == RELEASED_MARK
+    assert twice.first.duplicates == CHECKED
+    pages = open_supervisor(
+        plant.url(READER), plant.folder / "desk", gone.bench.key_locations, (), PlantStore,
+        PlantPages,
+    )  # fmt: skip
+    with closing(pages.store):
+        shown = pages.answer(Question("/runs")).body.decode()
+        assert shown.count("<small>duplicates not checked</small>") == 2, "in both tables"
+        unit = pages.answer(Question("/units", {"serial": SERIAL, "part": "BAT-36"})).body.decode()
+        assert unit.count(RELEASED_MARK) == 1
+        assert pages.answer(Question("/runs.csv")).body.decode().count(RELEASED_MARK) == 1
+    ((arrived,),) = plant.rows("SELECT run_id FROM released_claim")
+    assert arrived == runs["line-2"].run_id
+    with closing(Central(plant.url(READER))) as central, central.reading() as connection:
+        (old,) = releases_of(connection, ClaimFilter())
+        assert claims_of(connection, ClaimFilter()) == []
+    facts = (old.station, old.serial, old.reason, old.released_by, old.run_id, old.outcome)
+    assert facts == ("line-2", SERIAL, "its disk is broken", OWNER, arrived, "PASS")
+    assert run == gone.bench.store.read.table()[0].run_id
+
+
+def test_a_claim_that_is_renewed_is_not_released(plant: Plant, lines: tuple[Line, Line]) -> None:
+    lines[0].claim()
+    with pytest.raises(UsageError, match="nothing was released"):
+        released(plant, station="line-2")
+    expire(plant)
+    lines[0].claims.tend()
+    with pytest.raises(UsageError, match="nothing was released"):
+        released(plant, station="line-2")
+    expire(plant)
+    with pytest.raises(UsageError, match="nothing was released"):
+        released(plant, station="line-3")
+    assert plant.rows("SELECT count(*) FROM plant_claim") == [(1,)]
+
+
+def test_a_release_and_its_renewal_at_the_same_moment(
+    plant: Plant, lines: tuple[Line, Line]
+) -> None:
+    lines[0].claim()
+    expire(plant)
+    with plant.connect() as renewal:  # not committed yet
+        renewal.execute("UPDATE plant_claim SET expires_at = now() + interval '1 min'")
+        with ThreadPoolExecutor() as pool:
+            release_ = pool.submit(released, plant, serial=SERIAL)
+            waits = "SELECT count(*) FROM pg_locks WHERE NOT granted"
+            while plant.rows(waits) == [(0,)] and not release_.done():
+                pass
+            renewal.commit()
+            with pytest.raises(UsageError, match="nothing was released"):
+                release_.result()
+    assert plant.rows("SELECT count(*) FROM plant_claim") == [(1,)]
+
+
+@pytest.mark.parametrize("role", [READER, COURIER])
+def test_only_the_owner_releases_claims(plant: Plant, lines: tuple[Line, Line], role: str) -> None:
+    lines[0].claim()
+    expire(plant)
+    with (
+        closing(Central(plant.url(role))) as central,
+        pytest.raises(UsageError, match="Only the owner of the plant's database may release"),
+    ):
+        release(central, ClaimFilter(serial=SERIAL), "x")
+    assert plant.rows("SELECT count(*) FROM plant_claim") == [(1,)]

@@ -36,6 +36,7 @@ examples:
   flasher plant report --database postgresql://reader@plant-db/flasher --since 2026-05-17
   flasher plant pages --database postgresql://reader@plant-db/flasher
   flasher plant verify --database postgresql://reader@plant-db/flasher
+  flasher plant claims --database postgresql://reader@plant-db/flasher
   flasher plant publish recipe.toml --station line-2 --database postgresql://anna@plant-db/flasher
   flasher plant recipes --database postgresql://reader@plant-db/flasher
   flasher plant retire --database postgresql://owner@plant-db/flasher --archive DIR --keep-months 24
@@ -167,6 +168,38 @@ def verify(output: Output, database: str, archive: Path | None) -> int:
     PASS against its trace. Exit code 10 if something was changed.
     """
     return _call("reading.verify", output, database, archive)
+
+
+@dataclass(frozen=True)
+class ClaimOptions:
+    """Options: which claims, as in `flasher.plant.claim_list.ClaimFilter`."""
+
+    station: Annotated[str | None, option(
+        "--station", metavar="NAME", brief=True, help="only of this station",
+    )]  # fmt: skip
+    part: Annotated[str | None, option("--part", metavar="NAME", help="only of this part")]
+    serial: Annotated[str | None, option(
+        "--serial", metavar="SERIAL", brief=True, help="only of this unit",
+    )]  # fmt: skip
+
+
+@plant.action("claims")
+@option_set("options", ClaimOptions)
+@option(
+    "--release", "releases", is_flag=True, brief=True,
+    help="release those that have expired: their station does not return. Only the owner of the "
+    "database may do it",
+)  # fmt: skip
+@option("--reason", metavar="TEXT", brief=True, help="the reason, for the records")
+@_database_option
+def claims(
+    output: Output, options: ClaimOptions, database: str, reason: str | None, *, releases: bool
+) -> int:
+    """List the units that stations claim and whose run has not arrived, and the claims that were
+    released. While a claim exists, other stations do not know whether its unit has passed. A run
+    that arrives after its claim was released is marked: duplicates not checked.
+    """
+    return _call("claims.claims", output, database, options, releases=releases, reason=reason)
 
 
 @plant.action("retire")

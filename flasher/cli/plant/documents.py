@@ -8,6 +8,7 @@ from typing import Final
 from flasher.cli.station.documents import StationReportDocument
 from flasher.plant.activity import Activity
 from flasher.plant.alerts import StationCheck
+from flasher.plant.claim_list import ReleasedClaim, UnitClaim
 from flasher.plant.deliveries import DeliveryState, RunDocument
 from flasher.plant.delivery_list import Delivery, ReceiverStatus
 from flasher.plant.fetcher import Fetched
@@ -103,6 +104,16 @@ class PlantUnitsDocument:
 
 
 @dataclass(frozen=True)
+class PlantClaimsDocument:
+    """Units that stations claim, and claims that were released."""
+
+    claims: list[UnitClaim]
+    """Oldest first."""
+    released: list[ReleasedClaim]
+    """The newest 100, newest first."""
+
+
+@dataclass(frozen=True)
 class PlantDeliverDocument:
     """Result of `flasher plant deliver`."""
 
@@ -132,6 +143,7 @@ DOCUMENTS: Final = (
     PlantFetchDocument,
     PlantPublishDocument,
     PlantRecipesDocument,
+    PlantClaimsDocument,
     PlantDeliverDocument,
     PlantDeliveriesDocument,
     Reconciliation,
