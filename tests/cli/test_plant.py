@@ -243,6 +243,32 @@ def test_a_server_that_is_away_is_named_without_the_password(flasher: Flasher) -
     assert PASSWORD not in run.err
 
 
+@pytest.mark.parametrize(
+    ("of", "cause"),
+    [
+        ("flasher_line_2:wrong", 'password authentication failed for user "flasher_line_2"'),
+        ("nobody:x", 'password authentication failed for user "nobody"'),
+        ("flasher_line_2", "no password supplied"),
+    ],
+)
+def test_a_server_that_refuses_a_user_is_not_one_that_is_away(
+    flasher: Flasher, plant: Plant, of: str, cause: str
+) -> None:
+    url = f"postgresql://{of}@127.0.0.1:{plant.server.port}/{plant.database}"
+    run = flasher("plant", "status", "--database", url)
+    assert run.code == ExitCode.USAGE
+    assert "the database server refuses the connection" in run.err
+    assert cause in run.err
+    assert "pg_hba.conf" in run.err
+
+
+def test_a_database_that_is_not_there_is_named(flasher: Flasher, postgres: Server) -> None:
+    url = postgres.url("nowhere").replace("+psycopg", "")
+    run = flasher("plant", "status", "--database", url)
+    assert "the database server refuses the connection" in run.err
+    assert 'database "nowhere" does not exist' in run.err
+
+
 def test_a_station_sends_while_it_runs(
     flasher: Flasher, plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -202,6 +202,11 @@ _NO_SERVER: Final[_Kind] = (
     "the database server cannot be reached, or ended the connection",
     "Check the server, the network, and in the URL host, port, user, password and database.",
 )
+_TURNED_AWAY: Final[_Kind] = (
+    RecordError,
+    "the database server refuses the connection",
+    "Check in the URL user, password and database, and at the server pg_hba.conf.",
+)
 _TOO_SLOW: Final[_Kind] = (
     RecordsLockedError,
     "the database server did not finish in time",
@@ -217,6 +222,7 @@ _POSTGRESQL: Final[dict[str, _Kind]] = {
     "": _NO_SERVER,
     "08": _NO_SERVER,
     "23": _RULE,
+    "28": _TURNED_AWAY,
     "25006": (
         RecordsReadOnlyError,
         "the database is read-only",
@@ -253,6 +259,19 @@ _SYSTEM: Final[dict[int, _Kind]] = {
 }
 
 
+def _state_of(original: object) -> str:
+    """SQLSTATE of an error of psycopg. One of connecting has none, but its connection knows whether
+    the server asked for a password, and its text has the server's answer.
+    """
+    state: str = getattr(original, "sqlstate", None) or ""
+    connection = getattr(original, "pgconn", None)
+    if not state and connection is not None:
+        asked = connection.needs_password or connection.used_password
+        if asked or "FATAL:" in str(original):
+            return "28"
+    return state
+
+
 @contextmanager
 def mapped(where: str, *, writes: bool, begin: str = "") -> Iterator[None]:
     """Map errors of the block to RecordErrors. `where` names the database in messages, which start
@@ -265,7 +284,7 @@ def mapped(where: str, *, writes: bool, begin: str = "") -> Iterator[None]:
     except (exc.SQLAlchemyError, sqlite3.Error) as found:
         original = getattr(found, "orig", None) or found
         if isinstance(found, exc.DBAPIError) and not isinstance(original, sqlite3.Error):
-            state = getattr(original, "sqlstate", None) or ""
+            state = _state_of(original)
             chosen = _POSTGRESQL.get(state) or _POSTGRESQL.get(state[:2], _UNKNOWN)
         else:
             code = getattr(original, "sqlite_errorcode", None) or 0
