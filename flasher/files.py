@@ -208,6 +208,13 @@ def is_regular(path: str | os.PathLike[str]) -> bool:
     return stat.S_ISREG(_mode(path))
 
 
+def is_open_to_all(path: str | os.PathLike[str]) -> bool:
+    """True for a file that every user of this computer may read or write. Raises UsageError for one
+    in a folder that may not be entered.
+    """
+    return os.name == "posix" and bool(_mode(path) & stat.S_IRWXO)
+
+
 def _mode(path: str | os.PathLike[str]) -> int:
     try:
         return os.stat(path).st_mode  # noqa: PTH116  a name that is not a path

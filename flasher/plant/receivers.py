@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Final, Literal
@@ -10,7 +11,7 @@ from urllib.parse import SplitResult, unquote, urlsplit
 from pydantic import Field, StringConstraints, field_validator, model_validator
 
 from flasher.errors import UsageError
-from flasher.files import read
+from flasher.files import is_open_to_all, read
 from flasher.protocol.text import printable
 from flasher.settings.toml_reader import Reader, TomlTable
 
@@ -143,6 +144,13 @@ def password_of(receiver: Receiver) -> str | None:
     """Read the password; None without one. Raises UsageError."""
     if not receiver.password_file:
         return None
+    if is_open_to_all(receiver.password_file):
+        raise UsageError(
+            f"Every user of this computer may read the password of {receiver.name}, or change it.",
+            where=printable(receiver.password_file),
+            remedy="Let the user of this program alone read it:"
+            f" chmod 600 {printable(shlex.quote(receiver.password_file))}",
+        )
     raw = read(receiver.password_file, _PASSWORD_MAX_SIZE, what="file with the password")
     try:
         password = raw.decode("utf-8").rstrip("\r\n")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -36,8 +37,11 @@ def test_addresses_have_the_usual_ports_and_files_are_beside_the_file(tmp_path: 
     assert mes.password_file == str(tmp_path / "mes.password")
     assert (broker.kind, broker.port, broker.topic) == ("mqtt", 1883, "flasher/runs")
     assert password_of(broker) is None
-    (tmp_path / "mes.password").write_text("s3cr3t\n", encoding="utf-8")
-    assert password_of(mes) == "s3cr3t"
+    file = tmp_path / "mes.password"
+    file.write_text("s3cr3t\n", encoding="utf-8")
+    for mode in (0o600, 0o400, 0o640):
+        file.chmod(mode)
+        assert password_of(mes) == "s3cr3t"
 
 
 @pytest.mark.parametrize(
@@ -75,9 +79,24 @@ def test_a_wrong_file_is_refused_and_no_password_shown(
 @pytest.mark.parametrize("content", [b"", b"\n", b"two\nlines\n", b"\xff"])
 def test_a_file_without_a_password(tmp_path: Path, content: bytes) -> None:
     mes, _ = load_receivers(written(tmp_path, GOOD))
+    (tmp_path / "mes.password").touch(0o600)
     (tmp_path / "mes.password").write_bytes(content)
     with pytest.raises(UsageError, match="not one line of text"):
         password_of(mes)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="its files have no mode")
+@pytest.mark.parametrize("mode", [0o604, 0o602, 0o666])
+def test_a_password_that_everybody_may_read_or_change_is_not_used(
+    tmp_path: Path, mode: int
+) -> None:
+    mes, _ = load_receivers(written(tmp_path, GOOD))
+    file = tmp_path / "mes.password"
+    file.write_text("s3cr3t\n", encoding="utf-8")
+    file.chmod(mode)
+    with pytest.raises(UsageError, match="Every user of this computer") as caught:
+        password_of(mes)
+    assert caught.value.remedy.endswith(f"chmod 600 {file}")
 
 
 def test_certificates_that_are_missing_or_none(tmp_path: Path) -> None:

@@ -73,8 +73,9 @@ def secrets(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("secrets")
     certify(folder)
     (folder / "acl").write_text(ACL, encoding="ascii")
-    (folder / "password").write_text("s3cr3t\n", encoding="ascii")
-    (folder / "wrong").write_text("other\n", encoding="ascii")
+    for name, password in (("password", "s3cr3t"), ("wrong", "other")):
+        (folder / name).touch(0o600)
+        (folder / name).write_text(f"{password}\n", encoding="ascii")
     return folder
 
 
