@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import date, datetime
 from pathlib import Path
@@ -16,7 +16,8 @@ from flasher.errors import UsageError
 from flasher.files import read
 from flasher.image.load import FILE_MAX_SIZE
 from flasher.plant.central import Central
-from flasher.plant.schema import plant_station, recipe_event, released_file, released_recipe
+from flasher.plant.schema import recipe_event, released_file, released_recipe
+from flasher.plant.stations import statuses
 from flasher.protocol.text import printable
 from flasher.settings.manifest import manifest_path
 from flasher.station.given_recipes import Bundle, RecipeFolder, bundle_of, parse_bundle
@@ -82,7 +83,7 @@ def publish(
     rule = loaded.recipe
     facts = {"name": rule.name, "revision": rule.revision, "part": rule.part}
     with central.writing() as connection:
-        _check_known(connection, stations)
+        _check_known(connection, stations, sockets)
         _check_revision(connection, bundle.digest, rule)
         for sha256, data in contents.items():
             connection.execute(
@@ -180,12 +181,24 @@ def _check_revision(connection: Connection, digest: str, rule: Recipe) -> None:
         )
 
 
-def _check_known(connection: Connection, stations: Sequence[str]) -> None:
-    known = set(connection.execute(select(plant_station.c.name)).scalars())
+def _check_known(connection: Connection, stations: Sequence[str], sockets: Sequence[str]) -> None:
+    """Check the named stations, and their sockets as far as they are known. Raises UsageError."""
+    known = {each.station: each.recipes for each in statuses(connection)}
     for name in stations:
         if name not in known:
-            listed = ", ".join(map(printable, sorted(known))) or "none"
             raise UsageError(
-                f"The plant has no station {printable(name)}: there are {listed}.",
+                f"The plant has no station {printable(name)}: {_listed(known)}.",
                 remedy="Correct the name, or add the station: flasher plant init --station NAME.",
             )
+        own = sorted(each.socket for each in known[name])
+        for socket in sockets if own else ():
+            if socket not in own:
+                raise UsageError(
+                    f"{printable(name)} has no socket {printable(socket)}: {_listed(own)}.",
+                    remedy="Correct the name. A new socket is known after its station was started.",
+                )
+
+
+def _listed(names: Iterable[str]) -> str:
+    shown = ", ".join(map(printable, sorted(names))) or "none"
+    return f"there {'are' if ',' in shown else 'is'} {shown}"

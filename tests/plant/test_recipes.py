@@ -137,6 +137,17 @@ def test_a_wrong_station_is_named_before_anything_is_stored(centre: Centre) -> N
     assert centre.plant.rows("SELECT count(*) FROM released_file") == [(0,)]
 
 
+def test_a_socket_that_a_station_does_not_have_is_named(centre: Centre) -> None:
+    centre.publish(REVISION_5, ("line-2",), ("Z",))  # the plant does not know its sockets yet
+    facts = {"digest": "", "socket": "A", "name": "Battery 36 V", "revision": "4", "sha256": ""}
+    centre.sender.bench.store.note(AuditEvent.RECIPE_USED, facts)
+    centre.sender.send()
+    with pytest.raises(UsageError, match="line-2 has no socket Z: there is A"):
+        centre.publish(REVISION_5, ("line-2",), ("A", "Z"))
+    centre.publish(REVISION_5, ("line-2", "line-3"), ("A",))
+    assert len(events_of(centre.central)) == 3
+
+
 @pytest.mark.parametrize("linked", ["recipe.toml", "bms.bin", "bms.bin.toml"])
 def test_a_link_is_named_and_not_published(centre: Centre, linked: str) -> None:
     write_recipe(centre.source, REVISION_5)
