@@ -12,8 +12,9 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-from collections.abc import Callable, Collection, Iterable, Mapping
-from contextlib import suppress
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import date
 from pathlib import Path
@@ -39,6 +40,7 @@ _FILES: Final = "files"
 _STATE: Final = "given.json"
 _PART: Final = ".part-"
 _STATE_MAX_SIZE: Final = 256 * 1024
+_PART_AGE_S: Final = 3600.0
 _NOT_KEPT: Final = "A recipe from the plant cannot be saved"
 _DAMAGED: Final = text(
     "The copy of a recipe from the plant is damaged. It is fetched again when the server can be"
@@ -155,7 +157,9 @@ class RecipeFolder:
 
     def save_given(self, given: Given) -> None:
         """Write what the plant gives, whole or not at all. Raises RecordError."""
-        self._write(self.folder / _STATE, [_GIVEN.dump_json(given)])
+        with self._part() as part:
+            _write(part / _STATE, [_GIVEN.dump_json(given)])
+            (part / _STATE).replace(self.folder / _STATE)
 
     def digests(self) -> tuple[str, ...]:
         """Digests of the bundles that are here."""
@@ -167,26 +171,23 @@ class RecipeFolder:
         """Add a bundle, whole or not at all; `fetch` returns the content of a file by its SHA-256
         in pieces. Raises RecordError, and ValueError for a file that has another hash.
         """
-        part = self.folder / f"{_PART}{token_hex(4)}"
-        try:
+        with self._part() as part:
             for name, sha256 in bundle.files.items():
-                found = self._write(part / _FILES / name, fetch(sha256))
-                if found != sha256:
+                if _write(part / _FILES / name, fetch(sha256)) != sha256:
                     raise ValueError(f"{name} has another hash than its manifest states")
-            self._write(part / _MANIFEST, [bundle.to_text().encode("ascii")])
-            with mapped(printable(str(self.folder)), writes=True, begin=_NOT_KEPT):
-                final = self.folder / bundle.digest
-                shutil.rmtree(final, ignore_errors=True)  # a damaged copy
-                part.replace(final)
-                sync_folder(self.folder)
-        finally:
-            shutil.rmtree(part, ignore_errors=True)
+            _write(part / _MANIFEST, [bundle.to_text().encode("ascii")])
+            final = self.folder / bundle.digest
+            shutil.rmtree(final, ignore_errors=True)  # a damaged copy
+            part.replace(final)
 
     def keep(self, digests: Collection[str]) -> None:
         """Delete other bundles, and what a killed process left."""
         with suppress(OSError):
             for each in self.folder.iterdir():
-                if each.is_dir() and each.name not in digests:
+                # Another process may be fetching into a young one.
+                is_young = time.time() - each.stat().st_mtime < _PART_AGE_S
+                is_kept = is_young if each.name.startswith(_PART) else each.name in digests
+                if each.is_dir() and not is_kept:
                     shutil.rmtree(each, ignore_errors=True)
 
     def is_whole(self, digest: str) -> bool:
@@ -223,24 +224,29 @@ class RecipeFolder:
             raise _damaged(folder) from error
         return bundle
 
-    def _write(self, path: Path, pieces: Iterable[bytes]) -> str:
-        """Write a file beside its place, then move it there; returns its SHA-256."""
-        digest = hashlib.sha256()
-        part = path.with_name(f"{_PART}{token_hex(4)}")
-        with mapped(printable(str(path)), writes=True, begin=_NOT_KEPT):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                with part.open("wb") as out:
-                    for piece in pieces:
-                        digest.update(piece)
-                        out.write(piece)
-                    out.flush()
-                    os.fsync(out.fileno())
-                part.replace(path)
-            finally:
-                with suppress(OSError):
-                    part.unlink(missing_ok=True)
-        return digest.hexdigest()
+    @contextmanager
+    def _part(self) -> Iterator[Path]:
+        """Yields a new folder, in which is prepared what then gets its name. Raises RecordError."""
+        part = self.folder / f"{_PART}{token_hex(4)}"
+        try:
+            with mapped(printable(str(self.folder)), writes=True, begin=_NOT_KEPT):
+                yield part
+                sync_folder(self.folder)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+
+
+def _write(path: Path, pieces: Iterable[bytes]) -> str:
+    """Write a file to the disk; returns its SHA-256."""
+    digest = hashlib.sha256()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("wb") as out:
+        for piece in pieces:
+            digest.update(piece)
+            out.write(piece)
+        out.flush()
+        os.fsync(out.fileno())
+    return digest.hexdigest()
 
 
 def _damaged(path: Path) -> UsageError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -415,6 +416,24 @@ def test_a_changed_copy_is_refused(plant: Plant, what: str) -> None:
     with pytest.raises(UsageError, match="damaged"):
         plant.folder.load(digest, DAY)
     assert not plant.folder.is_whole(digest)
+
+
+def test_two_processes_may_fetch_at_once(plant: Plant) -> None:
+    """`flasher plant fetch` by hand, while the station's own process has begun to."""
+    bundle = bundle_of(plant.line.bench.recipe)
+    files = {sha: plant.line.bench.folder / name for name, sha in bundle.files.items()}
+    old = plant.folder.folder / ".part-old"
+    old.mkdir(parents=True)
+    os.utime(old, (0.0, 0.0))
+
+    def fetch(sha256: str) -> list[bytes]:
+        plant.folder.save_given(Given())
+        plant.folder.keep(())
+        return [files[sha256].read_bytes()]
+
+    plant.folder.add(bundle, fetch)
+    assert plant.folder.is_whole(bundle.digest)
+    assert not old.exists(), "a process that was killed left it"
 
 
 def test_a_file_that_was_added_to_a_copy_is_refused(plant: Plant) -> None:
