@@ -147,7 +147,7 @@ def _offer(offer: OfferedRecipe, translate: Translator) -> dict[str, Any]:
     """A recipe that waits for its approval."""
     published = text(
         "published {at} by {name}",
-        at=printable(offer.published_at[:16].replace("T", " ")),
+        at=f"{datetime.fromisoformat(offer.published_at).astimezone():%Y-%m-%d %H:%M}",
         name=printable(offer.published_by),
     )
     return {

@@ -7,6 +7,7 @@ import itertools
 import random
 import time
 from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
 from typing import Literal
 
 import pytest
@@ -17,8 +18,10 @@ from flasher.i18n import text
 from flasher.station.events import (
     LineResumed,
     LineStopped,
+    OfferedRecipe,
     PinAwaited,
     PinEnded,
+    RecipesOffered,
     ScanAccepted,
     ScanRefused,
     SocketChanged,
@@ -364,3 +367,39 @@ def test_everything_fits(tab: Tab, count: int, sizes: list[str]) -> None:
                     page.set_viewport_size({"width": width, "height": height})
                     assert page.evaluate(TOO_LARGE) == [], (language, size)
     line.hang()
+
+
+# -- recipes from the plant ------------------------------------------------------------------------
+
+
+def _offer(revision: str) -> RecipesOffered:
+    offer = OfferedRecipe(
+        f"Battery 36 V, {revision}",
+        revision * 64,
+        ("A", "B"),
+        "2026-05-17T10:00:00+02:00",
+        "anna",
+        (f"revision: {revision}, was 4",),
+        f"RECIPE {revision * 12}",
+    )
+    return RecipesOffered((offer,), at=AT)
+
+
+def test_a_recipe_that_comes_while_another_one_is_read_is_not_approved_for_it(
+    page: Page, line: LineScreen
+) -> None:
+    line.say(_offer("5"))
+    page.click("#show-offers")
+    offers = page.locator("#offers")
+    expect(offers.locator("h3")).to_have_text("Battery 36 V, 5")
+    at = datetime(2026, 5, 17, 8, tzinfo=UTC).astimezone()
+    expect(offers.locator(".published")).to_have_text(f"published {at:%Y-%m-%d %H:%M} by anna")
+    line.say(_offer("6"))
+    expect(offers).to_be_hidden()
+    page.click("#show-offers")
+    expect(offers.locator("h3")).to_have_text("Battery 36 V, 6")
+    page.click("#offers .approve button")
+    page.wait_for_function("() => waiting.length === 0 && !isSending")
+    assert line.scans == ["RECIPE 666666666666"]
+    line.say(RecipesOffered((), at=AT))
+    expect(offers).to_be_hidden()

@@ -108,8 +108,9 @@ function showHead(head) {
   }
 }
 
-// Built again only when it changes, so that a list keeps its place while it is read.
-let offered = "";
+// Built again only when it changes, so that a list keeps its place while it is read. A new recipe
+// closes it: the button of another recipe must not come under the finger.
+let offered = "[]";
 
 function showOffers(head) {
   const now = JSON.stringify(head.offered);
@@ -117,8 +118,10 @@ function showOffers(head) {
   if (now === offered) {
     return;
   }
+  const known = new Set(JSON.parse(offered).map((offer) => offer.digest));
+  const isNew = head.offered.some((offer) => !known.has(offer.digest));
   offered = now;
-  byId("offers").hidden = byId("offers").hidden || head.offered.length === 0;
+  byId("offers").hidden ||= isNew || head.offered.length === 0;
   byId("offer-list").replaceChildren(...head.offered.map((offer) => {
     const box = byId("offer").content.firstElementChild.cloneNode(true);
     const part = (name) => box.querySelector(name);
