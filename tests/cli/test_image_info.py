@@ -199,3 +199,14 @@ def test_a_release_is_shown_by_another_command(flasher: Flasher, tmp_path: Path)
     assert "[E311]" in flasher("image-info", release).err
     other = release.rename(tmp_path / "other.zip")
     assert "a zip archive" in flasher("image-info", other).err
+
+
+def test_an_image_that_names_another_target_is_refused_as_flash_refuses_it(
+    flasher: Flasher,
+) -> None:
+    run = flasher("image-info", SAMPLES / "wmc.hex", "-t", "bms")
+    assert run.code == ExitCode.WRONG_DEVICE == flasher(
+        "flash", SAMPLES / "wmc.hex", "-t", "bms", "--mock"
+    ).code  # fmt: skip
+    assert "the image names the WMC inside, not the BMS" in run.err
+    assert "names:   WMC" in run.out

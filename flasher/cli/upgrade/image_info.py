@@ -27,7 +27,7 @@ from flasher.cli.output import Output, counted
 from flasher.cli.upgrade import text
 from flasher.cli.upgrade.manifest import ManifestBesideDocument, beside_line, manifest_beside
 from flasher.errors import ExitCode, FlasherError, ImageError, UsageError
-from flasher.host.identity import IdentityCheck, judge_bytes
+from flasher.host.identity import IdentityCheck, judge_bytes, judge_image
 from flasher.image.cortexm import vector_table
 from flasher.protocol.spec import BMS, Target
 from flasher.protocol.text import printable
@@ -79,7 +79,7 @@ class ImagesInfoDocument:
 DOCUMENTS: Final = (ImageInfoDocument, ImagesInfoDocument)
 
 
-@command(epilog=_EXAMPLES, exit_codes=(ExitCode.IMAGE,))
+@command(epilog=_EXAMPLES, exit_codes=(ExitCode.IMAGE, ExitCode.WRONG_DEVICE))
 @image_argument("images", nargs=-1, required=True, metavar="IMAGE...")
 @option_set("selection", SentSelection)
 @allow_implausible_option("image")
@@ -179,7 +179,10 @@ def _show(
         release = image.find_release()
     waived = frozenset({IdentityCheck.PLAUSIBLE} if allow_implausible else ())
     identity = settings.identity(release=release, waived=waived)
-    for found in judge_bytes(loaded, identity):
+    judged = (
+        judge_bytes(loaded, identity) if target is None else judge_image(loaded, target, identity)
+    )
+    for found in judged:
         error = api.refusal(plan, found)
         if error is not None:
             return document, error
