@@ -114,7 +114,11 @@ BEGIN
     END IF;
     SELECT id INTO r.unit_id FROM unit
         WHERE part = own->'unit'->>'part' AND serial = own->'unit'->>'serial';
-    r.unit_id := coalesce(r.unit_id, plant_named('unit', '{{part,serial}}', own->'unit'));
+    IF r.unit_id IS NULL THEN
+        INSERT INTO unit (part, serial) VALUES (own->'unit'->>'part', own->'unit'->>'serial')
+            ON CONFLICT (part, serial) DO UPDATE SET serial = excluded.serial  -- of now
+            RETURNING id INTO r.unit_id;
+    END IF;
     SELECT id INTO r.operator_id FROM operator WHERE name = shared->'operator'->>'name';
     r.operator_id := coalesce(r.operator_id,
         plant_named('operator', '{{name}}', shared->'operator'));
@@ -138,11 +142,9 @@ BEGIN
         WITH ORDINALITY AS x(each, at);
     r.id := floor(extract(epoch FROM r.begun_at::timestamptz) * 1000000);
     LOOP
-        BEGIN
-            INSERT INTO run SELECT r.*;
-            EXIT;
-        EXCEPTION WHEN unique_violation THEN r.id := r.id + 1;
-        END;
+        INSERT INTO run SELECT r.* ON CONFLICT (id) DO NOTHING;
+        EXIT WHEN FOUND;
+        r.id := r.id + 1;
     END LOOP;
     INSERT INTO run_target (run_id, artifact_id, position, target, required, reached)
         SELECT r.id, images[at], t.position, t.target, t.required, t.reached
