@@ -95,23 +95,36 @@ END $$
 """
 """Finds a row by its names in a table of the station's schema, or inserts it; returns its id."""
 
+_IDS: Final = f"""
+CREATE OR REPLACE FUNCTION plant_ids_of(of_station bigint, part text, content jsonb) RETURNS jsonb
+LANGUAGE plpgsql {DEFINER} AS $$
+BEGIN
+    RETURN CASE part
+        WHEN 'station' THEN to_jsonb(plant_named('station', '{{name}}', content))
+        WHEN 'socket' THEN to_jsonb(plant_named('socket', '{{station_id,name}}',
+            content || jsonb_build_object('station_id', of_station)))
+        WHEN 'operator' THEN to_jsonb(plant_named('operator', '{{name}}', content))
+        WHEN 'lot' THEN to_jsonb(plant_named('lot', '{{part,name}}', content))
+        WHEN 'recipe' THEN to_jsonb(plant_named('recipe', '{{name,revision,part,sha256,content,'
+            'verification_required,allow_completed_not_read_back}}', content))
+        WHEN 'artifacts' THEN (SELECT jsonb_agg(
+            plant_named('artifact', '{{target,name,version,sha256,size_bytes}}', each) ORDER BY at)
+            FROM jsonb_array_elements(content) WITH ORDINALITY AS x(each, at))
+    END;
+END $$
+"""
+"""Returns the id of a shared part in its table, or those of several artifacts."""
+
 _ADD_RUN: Final = f"""
-CREATE OR REPLACE FUNCTION plant_add_run(own jsonb, shared jsonb) RETURNS bigint
+CREATE OR REPLACE FUNCTION plant_add_run(own jsonb, ids jsonb) RETURNS bigint
 LANGUAGE plpgsql {DEFINER} AS $$
 DECLARE
     r run := jsonb_populate_record(NULL::run, own->'run');
-    images bigint[];
-    here bigint;
 BEGIN
-    -- Looked up here first: their plans are cached, those of plant_named are made each time.
-    SELECT id INTO here FROM station WHERE name = shared->'station'->>'name';
-    here := coalesce(here, plant_named('station', '{{name}}', shared->'station'));
-    SELECT id INTO r.socket_id FROM socket
-        WHERE station_id = here AND name = shared->'socket'->>'name';
-    IF r.socket_id IS NULL THEN
-        r.socket_id := plant_named('socket', '{{station_id,name}}',
-            (shared->'socket') || jsonb_build_object('station_id', here));
-    END IF;
+    r.socket_id := ids->>'socket';
+    r.operator_id := ids->>'operator';
+    r.lot_id := ids->>'lot';
+    r.recipe_id := ids->>'recipe';
     SELECT id INTO r.unit_id FROM unit
         WHERE part = own->'unit'->>'part' AND serial = own->'unit'->>'serial';
     IF r.unit_id IS NULL THEN
@@ -119,27 +132,6 @@ BEGIN
             ON CONFLICT (part, serial) DO UPDATE SET serial = excluded.serial  -- of now
             RETURNING id INTO r.unit_id;
     END IF;
-    SELECT id INTO r.operator_id FROM operator WHERE name = shared->'operator'->>'name';
-    r.operator_id := coalesce(r.operator_id,
-        plant_named('operator', '{{name}}', shared->'operator'));
-    SELECT id INTO r.lot_id FROM lot
-        WHERE part = shared->'lot'->>'part' AND name = shared->'lot'->>'name';
-    r.lot_id := coalesce(r.lot_id, plant_named('lot', '{{part,name}}', shared->'lot'));
-    SELECT t.id INTO r.recipe_id FROM recipe t,
-        jsonb_populate_record(NULL::recipe, shared->'recipe') k
-        WHERE t.sha256 = k.sha256 AND t.name = k.name AND t.revision = k.revision
-        AND t.part = k.part AND t.verification_required = k.verification_required
-        AND t.allow_completed_not_read_back = k.allow_completed_not_read_back
-        AND t.content = k.content;
-    r.recipe_id := coalesce(r.recipe_id, plant_named('recipe', '{{name,revision,part,sha256,'
-        'content,verification_required,allow_completed_not_read_back}}', shared->'recipe'));
-    SELECT array_agg(coalesce((SELECT t.id FROM artifact t,
-            jsonb_populate_record(NULL::artifact, each) k
-            WHERE t.sha256 = k.sha256 AND t.target = k.target AND t.name = k.name
-            AND t.version = k.version AND t.size_bytes = k.size_bytes),
-            plant_named('artifact', '{{target,name,version,sha256,size_bytes}}', each))
-        ORDER BY at) INTO images FROM jsonb_array_elements(shared->'artifacts')
-        WITH ORDINALITY AS x(each, at);
     r.id := floor(extract(epoch FROM r.begun_at::timestamptz) * 1000000);
     LOOP
         INSERT INTO run SELECT r.* ON CONFLICT (id) DO NOTHING;
@@ -147,7 +139,8 @@ BEGIN
         r.id := r.id + 1;
     END LOOP;
     INSERT INTO run_target (run_id, artifact_id, position, target, required, reached)
-        SELECT r.id, images[at], t.position, t.target, t.required, t.reached
+        SELECT r.id, (ids->'artifacts'->>(at - 1)::int)::bigint, t.position, t.target, t.required,
+            t.reached
         FROM jsonb_array_elements(own->'targets') WITH ORDINALITY AS x(each, at),
             jsonb_populate_record(NULL::run_target, each) t ORDER BY at;
     WITH s AS (SELECT * FROM jsonb_populate_recordset(NULL::step, own->'steps')),
@@ -181,9 +174,10 @@ DECLARE
     head chain_row;
     stated jsonb;
     own jsonb;
-    shared jsonb := '{{}}';
+    ids jsonb := '{{}}';
     part text;
     body text;
+    known jsonb;
     refusal text;
 BEGIN
     SELECT * INTO mine FROM plant_station WHERE role = session_user FOR UPDATE;
@@ -245,21 +239,27 @@ BEGIN
         END IF;
     END LOOP;
     own := NEW.content::jsonb;
-    FOREACH part IN ARRAY ARRAY[{_SHARED}] LOOP
-        SELECT content INTO body FROM shared_part
-            WHERE station = NEW.station AND sha256 = stated->>part;
-        IF NOT FOUND THEN
+    FOR part, body, known IN SELECT wanted, s.content, s.ids->wanted
+        FROM unnest(ARRAY[{_SHARED}]) wanted LEFT JOIN shared_part s
+        ON s.station = NEW.station AND s.sha256 = stated->>wanted
+    LOOP
+        IF body IS NULL THEN
             RAISE EXCEPTION 'edited: % of run %, row %', part, NEW.run_number, NEW.number
                 USING ERRCODE = '{REFUSED}';
         END IF;
-        shared := shared || jsonb_build_object(part, body::jsonb);
+        IF known IS NULL THEN
+            known := coalesce(plant_ids_of(NEW.station_id, part, body::jsonb), 'null');
+            UPDATE shared_part s SET ids = s.ids || jsonb_build_object(part, known)
+                WHERE s.station = NEW.station AND s.sha256 = stated->>part;
+        END IF;
+        ids := ids || jsonb_build_object(part, known);
     END LOOP;
     IF (own->'run'->>'id')::bigint <> NEW.run_number OR own->'run'->>'state' = 'RUNNING'
-            OR shared->'station'->>'name' <> mine.name THEN
+            OR (ids->>'station')::bigint IS DISTINCT FROM NEW.station_id THEN
         RAISE EXCEPTION 'edited: row % is not of run %', NEW.number, NEW.run_number
             USING ERRCODE = '{REFUSED}';
     END IF;
-    NEW.run_id := plant_add_run(own, shared);
+    NEW.run_id := plant_add_run(own, ids);
     UPDATE chain_row SET run_id = NEW.run_id
         WHERE station = NEW.station AND run_number = NEW.run_number;
     RETURN NEW;
@@ -267,7 +267,7 @@ END $$
 """
 """Checks an audit row before it is inserted, and adds its run to the tables of runs."""
 
-FUNCTIONS: Final = (_MY_STATION, _ENTER, _REPORT, _NAMED, _ADD_RUN, _BRING)
+FUNCTIONS: Final = (_MY_STATION, _ENTER, _REPORT, _NAMED, _IDS, _ADD_RUN, _BRING)
 
 _GUARDED: Final = ("chain_row", "shared_part", "trace", "plant_station")
 """Tables with row level security."""
@@ -313,7 +313,8 @@ GRANT EXECUTE ON FUNCTION plant_my_station(), plant_enter(text, text),
     plant_report(text, bigint, text, double precision, bigint, text) TO {stations};
 GRANT INSERT (station, number, at, event, run_number, data, previous_hash, hash, signature, content)
     ON chain_row TO {stations};
-GRANT INSERT ON shared_part, trace TO {stations};
+GRANT INSERT (station, sha256, content) ON shared_part TO {stations};
+GRANT INSERT ON trace TO {stations};
 GRANT SELECT ON ALL TABLES IN SCHEMA public TO {readers};
 {policies}
 """

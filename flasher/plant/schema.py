@@ -30,11 +30,11 @@ from sqlalchemy import (
     func,
     text,
 )
-from sqlalchemy.dialects.postgresql import JSON
+from sqlalchemy.dialects.postgresql import JSON, JSONB
 
 from flasher.station.records import schema as station_schema
 
-PLANT_SCHEMA: Final = "10"
+PLANT_SCHEMA: Final = "11"
 """The newest Alembic revision in `migrations.versions`."""
 VERSION_TABLE: Final = "plant_version"
 STATION_TABLES: Final = tuple(
@@ -113,12 +113,14 @@ shared_part: Final = Table(
     Column("station", Uuid, nullable=False),
     Column("sha256", Text, nullable=False),
     Column("content", Text, nullable=False),
+    Column("ids", JSONB, nullable=False, server_default="{}"),
     PrimaryKeyConstraint("station", "sha256"),
     CheckConstraint(
         "sha256 = encode(sha256(convert_to(content, 'UTF8')), 'hex')", name="part_is_whole"
     ),
 )
-"""Rows that many runs of a station refer to (recipe, operator, images) by their digest."""
+"""Rows that many runs of a station refer to (recipe, operator, images) by their digest.
+`ids`: the rows of each part in the station's tables; `plant_bring` finds them once."""
 
 trace: Final = Table(
     "trace",

@@ -44,6 +44,10 @@ ATTEMPTS = {
     "write the chain of another station": (
         f"{_ROW} VALUES ({_THEIRS}, 99, '', 'sign-in', '', {_HASH}, {_HASH}, '')", REFUSED,
     ),
+    "send its images as those of others": (
+        "INSERT INTO shared_part (station, sha256, content, ids) VALUES"
+        f" ({_THEIRS}, encode(sha256('x'), 'hex'), 'x', 'null')", DENIED,
+    ),
     "write parts for another station": (
         f"INSERT INTO shared_part VALUES ({_THEIRS}, encode(sha256('x'), 'hex'), 'x')", POLICY,
     ),
