@@ -434,9 +434,9 @@ class Line:
         self.stop(codes.RECORD_NOT_SAVED.name, what.reason, what.remedy)
 
     def is_between_units(self, name: str) -> bool:
-        """True if no run and no scan needs the process of this socket."""
+        """True if no run, scan or question to the plant is about this socket as it is now."""
         socket = self.sockets[name]
-        return not (socket.is_busy or socket.is_chosen)
+        return not (socket.is_busy or socket.is_chosen or socket.asked)
 
     def restart(self, name: str, now: float) -> None:
         """The process of a socket between two units is replaced by another one."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from flasher.station.events import (
     ScanRefused,
     SocketState,
 )
+from flasher.station.gate import Gate
 from flasher.station.given_recipes import (
     Given,
     GivenRecipe,
@@ -37,6 +39,7 @@ from flasher.station.records.model import AuditEvent, RunState
 from tests.release.maker import chain_of, first_trust
 from tests.station.factory import DAY, HEAD, SERIAL, USUAL, Bench, make_recipe, target_table
 from tests.station.line_bench import LineBench
+from tests.station.test_gate import _Claims
 
 OTHER = "W2605003"
 OTHER_PART = USUAL.replace("Battery 36 V", "Battery 48 V").replace("BAT-36", "BAT-48")
@@ -56,9 +59,11 @@ def crew() -> Crew:
 class Plant:
     """The folder as the fetching process leaves it, and the station that watches it."""
 
-    def __init__(self, bench: Bench, *, people: Crew | None = None) -> None:
+    def __init__(
+        self, bench: Bench, *, people: Crew | None = None, gate: Gate | None = None
+    ) -> None:
         self.folder = RecipeFolder.of(bench.folder, "line-2")
-        self.line = LineBench(bench, crew=people or crew())
+        self.line = LineBench(bench, crew=people or crew(), gate=gate)
         self.offers = RecipeOffers(self.folder, "AB", lambda _recipe: None, self.line.station.offer)
         self._sources = 0
 
@@ -227,6 +232,24 @@ def test_a_run_finishes_with_the_recipe_that_it_began_with(plant: Plant) -> None
     plant.make("A", OTHER)
     assert plant.revision(OTHER) == "5"
     assert line.ports["A"].setup.recipe.is_relative_to(plant.folder.folder / digest)
+
+
+def test_the_recipe_stays_while_the_plant_is_asked_about_a_unit(bench: Bench) -> None:
+    """Its label may come back before the answer, which is about this recipe's part."""
+    threads: list[Callable[[], None]] = []
+    gate = Gate(bench.recipe.recipe, _Claims(), None, bench.clock.monotonic_s, start=threads.append)
+    plant = Plant(bench, gate=gate)
+    line = plant.line
+    line.scan(OPERATOR)
+    line.scan(SERIAL)
+    line.arrive("A")
+    line.leave("A")
+    plant.approve(plant.give(REVISION_5))
+    assert [each.socket for each in line.of(RecipeChanged)] == ["B"]
+    threads.pop()()
+    line.turn()
+    line.turn()
+    assert [each.socket for each in line.of(RecipeChanged)] == ["B", "A"]
 
 
 def test_a_change_that_cannot_be_recorded_is_tried_again_after_resume(
