@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import platform
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from secrets import token_hex
@@ -21,10 +21,12 @@ from uuid import UUID
 from sqlalchemy import Connection, select
 
 from flasher.errors import ErrorCode, UsageError
+from flasher.plant.archive import ArchiveReader, Rows
 from flasher.plant.central import Central, ChainRefusedError, Refusal, open_central
 from flasher.plant.forwarder import ADD_ROW, ENTER, row_values
 from flasher.plant.schema import (
     SHARED_PARTS,
+    archive_chain,
     chain_row,
     open_run,
     plant_station,
@@ -85,6 +87,8 @@ class Takeover:
     key_locations: KeyLocations
     by: str
     reason: str
+    archives: Path | None = None
+    """Folder of the files of retired months."""
 
     def run(self, key: bytes | None, now: Callable[[], datetime]) -> TakenOver:
         """Take the station over. `key`: the key file of an export, where this PC has none.
@@ -124,7 +128,7 @@ class Takeover:
             closing(Database(location, DEFAULT_LOCK_TIMEOUT_S, changes_schema=True)) as database,
             closing(Central(self.own_url)) as own,
         ):
-            copy = _Copy(self.station, FileStore(location.folder))
+            copy = _Copy(self.station, FileStore(location.folder), self.archives)
             before: int | None = None
             for attempt in range(_TRIES):
                 with central.reading() as source:
@@ -203,11 +207,14 @@ class Takeover:
 
 
 class _Copy:
-    """Copies a station's rows from the plant's database, in the order of its audit trail."""
+    """Copies a station's rows from the plant's database, and from the files of retired months, in
+    the order of its audit trail.
+    """
 
-    def __init__(self, name: str, files: FileStore) -> None:
+    def __init__(self, name: str, files: FileStore, archives: Path | None) -> None:
         self._name = name
         self._files = files
+        self._archives = archives
         self._seen: dict[str, set[int]] = {name: set() for name in _SHARED}
         self._own_id = 0
         self._version: Any = None
@@ -230,16 +237,54 @@ class _Copy:
         """Copy the rows after the last one. Raises UsageError, RecordsDamagedError."""
         if not self.number:
             self._begin(source, connection, now)
+        with closing(self._rows(source)) as found:
+            for some in found:
+                self._check(some.rows)
+                self._add(source, connection, some)
+
+    def _rows(self, source: Connection) -> Generator[Rows, None, None]:
+        """Read the rows after the last one. Raises UsageError, RecordError."""
+        for path in self._retired(source):
+            with closing(ArchiveReader(path).read()) as found:
+                for some in found:
+                    rows = [row for row in some.rows if row["number"] > self.number]
+                    if some.station == self.station and rows:
+                        yield replace(some, rows=rows)
         query = (
             select(chain_row)
             .where(chain_row.c.station == self.station, chain_row.c.number > self.number)
             .order_by(chain_row.c.number)
             .execution_options(yield_per=_AT_ONCE)
         )
-        with source.execute(query) as rows:
-            for some in rows.mappings().partitions(_AT_ONCE):
-                self._check(some)
-                self._add(source, connection, some)
+        with source.execute(query) as found_rows:
+            for each in found_rows.mappings().partitions(_AT_ONCE):
+                parts = shared_parts(source, self.station, map(_digests, each))
+                yield Rows(self.station, list(map(dict, each)), parts, {})
+
+    def _retired(self, source: Connection) -> Sequence[Path]:
+        """Files with rows after the last one, oldest first. Raises UsageError."""
+        query = select(archive_chain.c.file).where(
+            archive_chain.c.station == self.station, archive_chain.c.last > self.number
+        )
+        names = source.execute(query.order_by(archive_chain.c.last)).scalars().all()
+        if names and self._archives is None:
+            raise UsageError(
+                f"Rows of {printable(self._name)} are in {len(names)} file(s) of retired months,"
+                f" from {printable(names[0])} to {printable(names[-1])}.",
+                remedy="Add --archive FOLDER, with the files that flasher plant retire wrote.",
+                code=ErrorCode.RECORDS_NOT_FOUND,
+            )
+        paths = [Path(self._archives or "", name) for name in names]
+        for path in paths:
+            if not path.exists():
+                raise UsageError(
+                    f"The file {printable(path.name)} with retired rows of {printable(self._name)}"
+                    " is not in the folder.",
+                    where=printable(str(path.parent)),
+                    remedy="Put all files that flasher plant retire wrote into this folder.",
+                    code=ErrorCode.RECORDS_NOT_FOUND,
+                )
+        return paths
 
     def _begin(self, source: Connection, connection: Connection, now: datetime) -> None:
         query = select(plant_station).where(plant_station.c.name == self._name)
@@ -252,18 +297,18 @@ class _Copy:
             )
         self.station, self.records_id = station["station"], station["records_id"]
         create_tables(connection, now, self.records_id)
-        first = (
-            select(chain_row.c.data)
-            .where(chain_row.c.station == self.station, chain_row.c.run_number.is_not(None))
-            .order_by(chain_row.c.number)
-            .limit(1)
-        )
-        digests = chain.data_of(source.execute(first).scalar_one_or_none() or "").get("digests", {})
-        found = shared_parts(source, self.station, [digests] if digests else []).get(
-            digests.get("station")
-        )
-        self._own_id = found["id"] if found else 1
+        self._own_id = self._own_id_in(source)
         self._insert(connection, "station", [{"id": self._own_id, "name": self._name}])
+
+    def _own_id_in(self, source: Connection) -> int:
+        """Id of the station in its records, which the digests of its runs cover."""
+        with closing(self._rows(source)) as found:
+            for some in found:
+                for row in some.rows:
+                    own = some.parts.get(_digests(row).get("station", ""))
+                    if own is not None:
+                        return int(own["id"])
+        return 1
 
     def _check(self, rows: Sequence[Mapping[Any, Any]]) -> None:
         """Check hashes and signatures. Raises RecordsDamagedError, UsageError."""
@@ -278,12 +323,7 @@ class _Copy:
                 or row["hash"] != chain.row_hash({**row, "run_id": row["run_number"]})
                 or not is_signed(row["hash"], row["signature"], self.public)
             ):
-                raise RecordsDamagedError(
-                    f"Row {row['number']} of {printable(self._name)} in the plant's database is"
-                    " not as the station signed it.",
-                    remedy="flasher plant verify reports what was changed. Take the station's own"
-                    " records or their backup.",
-                )
+                raise self._damaged(row["number"])
             self.number, self.hash = row["number"], row["hash"]
             self.public = following or self.public
             if row["event"] == chain.CLAIMED:
@@ -305,22 +345,32 @@ class _Copy:
                 code=ErrorCode.RECORDS_VERSION,
             )
 
-    def _add(
-        self, source: Connection, connection: Connection, rows: Sequence[Mapping[Any, Any]]
-    ) -> None:
-        """Add audit rows with the runs that end in them."""
-        ended = [row for row in rows if row["event"] in chain.ENDINGS]
-        stated = [chain.data_of(row["data"])["digests"] for row in ended]
-        parts = shared_parts(source, self.station, stated)
-        for row, digests in zip(ended, stated, strict=True):
-            own = row["content"]
-            self._add_shared(connection, {name: parts[digests[name]] for name in SHARED_PARTS}, own)
+    def _damaged(self, number: int) -> RecordsDamagedError:
+        return RecordsDamagedError(
+            f"Row {number} of {printable(self._name)} in the plant's database, or in a file of a"
+            " retired month, is not as the station signed it.",
+            remedy="flasher plant verify reports what was changed. Take the station's own records"
+            " or their backup.",
+        )
+
+    def _add(self, source: Connection, connection: Connection, some: Rows) -> None:
+        """Add audit rows with the runs that end in them. Raises RecordsDamagedError."""
+        rows = some.rows
+        for row in rows:
+            if row["event"] not in chain.ENDINGS:
+                continue
+            own, digests = row["content"], _digests(row)
+            if any(digests.get(name) not in some.parts for name in SHARED_PARTS):
+                raise self._damaged(row["number"])
+            named = {name: some.parts[digests[name]] for name in SHARED_PARTS}
+            self._add_shared(connection, named, own)
             self._insert(connection, "run", [own["run"]])
             for name, table in _PARTS.items():
                 self._insert(connection, table, own[name])
-            self._fetch(source, [file["sha256"] for file in own["attachments"]])
+            self._fetch(source, [file["sha256"] for file in own["attachments"]], some.traces)
             self.runs += 1
-        names = [each.name for each in schema.audit.c if each.name not in ("id", "run_id")]
+        others = {"id", "run_id", "station_id"}
+        names = [each.name for each in schema.audit.c if each.name not in others]
         connection.execute(
             schema.audit.insert(),
             [
@@ -351,14 +401,16 @@ class _Copy:
             values = [{name: row[name] for name in names} for row in new.values()]
             connection.execute(table.insert(), values)
 
-    def _fetch(self, source: Connection, wanted: Iterable[str]) -> None:
+    def _fetch(
+        self, source: Connection, wanted: Iterable[str], retired: Mapping[str, bytes]
+    ) -> None:
         """Fetch attachments that are not here. One that the plant lacks is left out: `verify`
         reports it.
         """
         for sha256 in wanted:
             if self._files.check(sha256):
                 query = select(trace.c.data).where(trace.c.sha256 == sha256)
-                data = source.execute(query).scalar_one_or_none()
+                data = retired.get(sha256) or source.execute(query).scalar_one_or_none()
                 if data is not None:
                     with tempfile.TemporaryDirectory(prefix="flasher-") as folder:
                         path = Path(folder) / "attachment"
@@ -417,6 +469,11 @@ def _send(own: Central, copy: _Copy, connection: Connection, name: str) -> None:
     with own.writing() as central:
         central.execute(ENTER, {"records": copy.records_id, "station": name})
         central.execute(ADD_ROW, row_values(row, copy.station))
+
+
+def _digests(row: Mapping[Any, Any]) -> dict[str, str]:
+    found: dict[str, str] = chain.data_of(row["data"]).get("digests", {})
+    return found
 
 
 def _with_log(file: Path) -> tuple[Path, ...]:

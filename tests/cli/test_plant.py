@@ -523,6 +523,18 @@ def test_an_export_that_cannot_be_opened_changes_nothing(exported: Export) -> No
     assert exported.sender.plant.rows("SELECT count(*) FROM open_run") == [(1,)]
 
 
+def test_a_takeover_names_the_option_for_retired_months(exported: Export) -> None:
+    plant, archive = exported.sender.plant, exported.folder / "archive"
+    exported.make()
+    place = ("--database", plant.url(), "--archive", archive, "--before", "2026-06")
+    assert exported.flasher("plant", "retire", *place).code == ExitCode.OK
+    words = (exported.spare, "--from", exported.sealed, *exported.secret())
+    run = exported.take_over(*words)
+    assert (run.code, "--archive" in run.err) == (ExitCode.USAGE, True)
+    run = exported.take_over(*words, "--archive", archive)
+    assert (run.code, run.err) == (ExitCode.OK, "")
+
+
 def test_a_spare_pc_continues_a_station_with_its_export(exported: Export) -> None:
     flasher, schema = exported.flasher, json.loads(SCHEMA.read_text("utf-8"))
     url = exported.sender.plant.url("flasher_desk")

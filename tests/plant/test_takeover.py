@@ -6,11 +6,12 @@ import shutil
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 
+from flasher.errors import UsageError
 from flasher.plant.central import ChainRefusedError, Refusal
 from flasher.plant.setup import role_of
 from flasher.plant.takeover import TakenOver, Takeover
@@ -32,6 +33,7 @@ from flasher.station.records.signatures import SigningKey
 from tests.plant.factory import READER, Plant, Sender
 from tests.plant.test_claims import Line, expire
 from tests.plant.test_retire import MONTH_S, retired
+from tests.plant.test_retire import examined as examined_with
 from tests.plant.test_verify import examined
 from tests.station.factory import FakeClock
 
@@ -39,11 +41,11 @@ pytestmark = pytest.mark.slow
 WHEN = datetime(2026, 5, 17, 12, tzinfo=UTC)
 
 
-def takeover_of(plant: Plant, folder: Path) -> Takeover:
+def takeover_of(plant: Plant, folder: Path, archives: Path | None = None) -> Takeover:
     return Takeover(
         "line-2", plant.url(READER), plant.url(role_of("line-2")),
         locate_records(str(folder / "records.sqlite")), KeyLocations(folder / "keys"),
-        "sv", "the PC died",
+        "sv", "the PC died", archives,
     )  # fmt: skip
 
 
@@ -69,8 +71,10 @@ def spare_of(plant: Plant, sender: Sender, name: str = "spare") -> Sender:
     return made
 
 
-def taken(plant: Plant, key: bytes | None, name: str = "spare") -> TakenOver:
-    return takeover_of(plant, plant.folder / name).run(key, FakeClock(WHEN).utc)
+def taken(
+    plant: Plant, key: bytes | None, name: str = "spare", archives: Path | None = None
+) -> TakenOver:
+    return takeover_of(plant, plant.folder / name, archives).run(key, FakeClock(WHEN).utc)
 
 
 def brought(spare: Sender, old: Path) -> BroughtIn:
@@ -280,6 +284,64 @@ def test_a_takeover_that_was_retired_still_holds(
     assert not other.asked("W2605003").doubt
     for each in (old, other):
         each.claims.close()
+
+
+@pytest.fixture
+def with_retired(plant: Plant, sender: Sender) -> Path:
+    """Two retired months of two stations, one with a run that has not ended; their folder."""
+    other = plant.sender("line-3")
+    for each, serials in ((sender, ("W2605001", "W2605002")), (other, ("W2605011", "W2605012"))):
+        for serial in serials:
+            each.bench.make(serial=serial)
+            each.bench.clock.go_on(MONTH_S)
+    sender.bench.claim("W2605003", "B")
+    sender.bench.store.note(AuditEvent.OPERATOR, {"name": "jo"})
+    for each in (sender, other):
+        each.send()
+        each.close()
+    assert [each.month for each in retired(plant, "2026-08")] == ["2026-05", "2026-06", "2026-07"]
+    return plant.folder / "archive"
+
+
+def test_retired_months_are_taken_from_their_files(
+    plant: Plant, sender: Sender, key: bytes, with_retired: Path, spares: list[Sender],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr("tests.plant.test_takeover.WHEN", WHEN + timedelta(days=90))
+    found = taken(plant, key, archives=with_retired)
+    assert (found.runs, found.active) == (2, ("W2605003",))
+    spares.append(spare := spare_of(plant, sender))
+    assert states(spare) == {
+        "W2605001": UnitState.PASS, "W2605002": UnitState.PASS, "W2605003": UnitState.RECHECK,
+    }  # fmt: skip
+    with pytest.raises(ClaimRefusedError) as caught:
+        spare.bench.claim("W2605001")
+    assert caught.value.refusal is RefusalReason.DUPLICATE
+    spare.bench.make(serial="W2605003")
+    spare.send()
+    assert not spare.bench.store.examine().problems
+    assert not examined_with(plant, with_retired).problems
+
+
+def test_files_of_retired_months_that_are_missing_or_damaged_are_named(
+    plant: Plant, key: bytes, with_retired: Path
+) -> None:
+    with pytest.raises(UsageError, match=r"line-2 are in \d file\(s\) of retired months") as caught:
+        taken(plant, key)
+    assert "--archive FOLDER" in caught.value.remedy
+    june = next(with_retired.glob("*-2026-06.tar.gz"))
+    data = june.read_bytes()
+    june.unlink()
+    with pytest.raises(UsageError, match=r"2026-06\.tar\.gz with retired rows of line-2 is not in"):
+        taken(plant, key, archives=with_retired)
+    june.write_bytes(data[: len(data) // 2])
+    with pytest.raises(RecordsDamagedError):
+        taken(plant, key, archives=with_retired)
+    june.write_bytes(next(with_retired.glob("*-2026-07.tar.gz")).read_bytes())
+    with pytest.raises(RecordsDamagedError, match="not as the station signed"):
+        taken(plant, key, archives=with_retired)
+    assert not (plant.folder / "spare" / "records.sqlite").exists()
+    assert plant.rows("SELECT DISTINCT takeover FROM plant_station") == [("",)]
 
 
 def test_a_pc_that_waits_for_the_unit_while_it_is_taken_over_does_not_claim_it(

@@ -518,6 +518,10 @@ def export(
     "--from", "sealed", brief=True,
     help="the sealed export (default: this PC has the key and the settings)",
 )  # fmt: skip
+@option(
+    "--archive", type=values.FolderPath(), metavar="DIR", brief=True,
+    help="the folder of the files of retired months, if the plant has any",
+)  # fmt: skip
 @_passphrase_option
 @_operator_option
 @_reason_option(required=True)
@@ -526,6 +530,7 @@ def take_over(
     sockets: Path,
     url: str,
     sealed: Path | None,
+    archive: Path | None,
     passphrase_file: Path | None,
     operator: str | None,
     reason: str,
@@ -535,7 +540,9 @@ def take_over(
     are taken from the export.
     """
     need("Taking a station over", "plant")
-    return _call("spare.take_over", output, sockets, url, sealed, passphrase_file, operator, reason)
+    return _call(
+        "spare.take_over", output, sockets, url, sealed, archive, passphrase_file, operator, reason
+    )
 
 
 @station.action("bring-in")

@@ -82,6 +82,7 @@ def take_over(
     sockets: Path,
     url: str,
     sealed: Path | None,
+    archives: Path | None,
     passphrase: Path | None,
     operator: str | None,
     reason: str,
@@ -110,7 +111,7 @@ def take_over(
     lock.acquire()
     try:
         found = Takeover(
-            config.name, url, config.plant, location, place.key_locations, who, reason
+            config.name, url, config.plant, location, place.key_locations, who, reason, archives
         ).run(key, clock.utc)
     finally:
         lock.release()
