@@ -21,6 +21,7 @@ from flasher.station.records.errors import (
     ClaimRefusedError,
     KeyMissingError,
     NotFoundError,
+    RecordError,
     RecordsDamagedError,
     StationBusyError,
     UnprovenError,
@@ -30,6 +31,7 @@ from flasher.station.records.files import FileStore
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import AuditEvent, RunId, RunState, UnitState
 from flasher.station.records.signatures import SigningKey
+from flasher.station.records.store import Store
 from tests.plant.factory import READER, Plant, Sender
 from tests.plant.test_claims import Line, expire
 from tests.plant.test_retire import MONTH_S, retired
@@ -431,6 +433,39 @@ def test_a_branch_that_was_sent_in_part_is_completed_after_the_next_takeover(
     assert not examined(plant).problems
     for each in (old, line):
         each.claims.close()
+
+
+def test_a_branch_within_a_branch_is_not_brought_in_twice(
+    plant: Plant, sender: Sender, key: bytes, spares: list[Sender]
+) -> None:
+    """The second PC had brought in what the first one had not sent, and could not send that."""
+    sender.bench.make(serial="W2605001")
+    sender.send()
+    sender.bench.make(serial="W2605002")
+    sender.bench.store.close()
+    taken(plant, key)
+    spares.append(second := spare_of(plant, sender))
+    second.send()
+    brought(second, sender.bench.path)
+    second.bench.make(serial="W2605003")
+    second.bench.store.close()
+    taken(plant, key, "third")
+    spares.append(third := spare_of(plant, sender, "third"))
+    assert len(brought(third, second.bench.path).runs) == 2
+    with pytest.raises(NotFoundError):
+        brought(third, sender.bench.path)
+    assert len(third.bench.store.read.table()) == 3
+    assert not third.bench.store.examine().problems
+
+
+@pytest.mark.parametrize("name", ["line-2", "line-3"])
+def test_other_records_are_not_brought_in(sender: Sender, tmp_path: Path, name: str) -> None:
+    path, keys = tmp_path / "records.sqlite", KeyLocations(tmp_path / "other")
+    with Store.open(str(path), station=name, clock=FakeClock(), key_locations=keys) as store:
+        store.recover()
+    with pytest.raises(RecordError, match="not records of the station line-2") as caught:
+        brought(sender, path)
+    assert str(path) in caught.value.where
 
 
 def test_a_changed_branch_is_not_brought_in(

@@ -61,7 +61,7 @@ def bring_in(
     """
     with branch.reading() as other:
         with store.database.reading() as own:
-            fork = _fork(own, other, store)
+            fork = _fork(own, other, store.station, branch.location.shown)
             key = chain.key_in_force(own, store.station, fork + 1)
         rows = _rows_after(other, store.station, fork)
         takeover = chain.last_takeover(other, store.station)
@@ -129,36 +129,43 @@ class Branch:
 
 
 def branches(connection: Connection, station: str) -> list[Branch]:
-    """What was brought into a station's records, in order."""
+    """What was brought into a station's records, in order, also within another branch."""
     found = []
-    rows = chain.rows_without_run(connection, station, [chain.BRANCH, chain.TAKEN_OVER])
-    for row, following in zip_longest(rows, rows[1:]):
-        if row.event == chain.BRANCH:
-            data = chain.data_of(row.data)
+    events = (chain.BRANCH, chain.BROUGHT_IN, chain.TAKEN_OVER)
+    rows = []
+    for row in chain.rows_without_run(connection, station, events):
+        event, data = row.event, chain.data_of(row.data)
+        if event == chain.BROUGHT_IN:
+            original = data["original"]
+            event, data = original["event"], chain.data_of(original["data"])
+        if event in (chain.BRANCH, chain.TAKEN_OVER):
+            rows.append((row.number, event, data))
+    for (number, event, data), following in zip_longest(rows, rows[1:]):
+        if event == chain.BRANCH:
             here = data["last"]
             if following is not None:
-                here = min(here, data["first"] + following.number - row.number - 2)
+                here = min(here, data["first"] + following[0] - number - 2)
             found.append(Branch(data.get("takeover"), data["head"], data["last"], here))
     return found
 
 
-def _fork(own: Connection, other: Connection, store: Store) -> int:
+def _fork(own: Connection, other: Connection, station: str, where: str) -> int:
     """The last row of `other` that the station has, or has brought in. Raises RecordError."""
-    for each in reversed(branches(own, store.station)):
-        if chain.hash_at(other, store.station, each.last) == each.head:
+    for each in reversed(branches(own, station)):
+        if chain.hash_at(other, station, each.last) == each.head:
             return each.here
-    low, high = 0, _last(other, store.station)
+    low, high = 0, _last(other, station)
     while low < high:  # rows are equal up to the fork, and none after it
         middle = (low + high + 1) // 2
-        found = chain.hash_at(own, store.station, middle)
-        if found is not None and found == chain.hash_at(other, store.station, middle):
+        found = chain.hash_at(own, station, middle)
+        if found is not None and found == chain.hash_at(other, station, middle):
             low = middle
         else:
             high = middle - 1
     if not low:
         raise RecordError(
-            f"These are not records of the station {printable(store.station)}.",
-            where=store.database.location.shown,
+            f"These are not records of the station {printable(station)}.",
+            where=where,
             remedy="Name the records of the PC that ran as this station.",
             code=ErrorCode.RECORDS,
         )
