@@ -79,8 +79,8 @@ class _Own:
     takeover: str
     """Hash of the audit row with which this PC took the station over; "" for the first PC."""
     known: frozenset[str | None]
-    """PCs whose runs these records have, each by its takeover: this one, and those that were
-    brought in.
+    """PCs of whose runs these records have all, each by its takeover: this one, unless an older
+    copy was restored, and those that were brought in.
     """
 
 
@@ -221,8 +221,11 @@ class PlantClaims:
             records = str(local.execute(select(schema.schema_info.c.records_id)).scalar_one())
             takeover = chain.last_takeover(local, self._station)
             last = {each.takeover: each for each in branches(local, self._station)}
-        whole = {takeover for takeover, branch in last.items() if branch.is_whole}
-        return _Own(records, takeover, frozenset({takeover, *whole}))
+            is_restored = bool(chain.rows_without_run(local, self._station, [chain.RESTORED]))
+        known = {each for each, branch in last.items() if branch.is_whole}
+        if not is_restored:  # the rows that are lost may have had runs
+            known.add(takeover)
+        return _Own(records, takeover, frozenset(known))
 
     def _unknown(self, central: Connection, own: _Own) -> list[str]:
         """Claims of this station with which no run began: the station died in between. What another

@@ -373,6 +373,29 @@ def test_a_claim_whose_run_is_recorded_is_not_released(
     assert there.asked().doubt
 
 
+def test_a_claim_whose_run_was_lost_with_the_disk_is_not_released(
+    plant: Plant, lines: tuple[Line, Line]
+) -> None:
+    here, there = lines
+    bench = here.bench
+    copy = bench.folder / "backup.sqlite"
+    bench.store.backup(copy)
+    here.end(here.claim())
+    bench.store.close()
+    here.sender.end()
+    for path in bench.folder.glob("records.sqlite*"):
+        if path.is_file():
+            path.unlink()
+    copy.replace(bench.path)
+    bench.store = bench.opened()
+    bench.store.signer.accept_restored("jo", "the disk is new")
+    bench.store.recover()
+    here.start()
+    here.claims.tend()
+    expire(plant)
+    assert there.asked().doubt.startswith("line-2 claimed it")
+
+
 @pytest.mark.parametrize(
     ("rule", "kind"), [("verify-only", "verify-only"), ("reflash-with-reason", "reflash")]
 )
