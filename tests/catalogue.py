@@ -32,7 +32,7 @@ from flasher.protocol.contents import BatteryFault, BatteryStatus
 from flasher.protocol.fields import FlagsField, flag_names, label
 from flasher.protocol.messages import BootVersion, Packet, UpdateCommand
 from flasher.report.chart import MarkKind
-from flasher.station.records.chain import NAMED, OWN
+from flasher.station.records.chain import NAMED, OWN, RowFault
 from flasher.station.records.errors import NOT_SAVED
 from flasher.station.records.model import (
     AFTER_RESTART,
@@ -71,6 +71,8 @@ _SYSTEM: Final = (
     "Read-only file system",
 )
 """Errors of Linux that users meet."""
+_SHOWN: Final = (RunKind, StepName, StepState, MarkKind, RowFault)
+"""Enumerations whose values are shown."""
 ROOT: Final = Path(__file__).parent.parent / "flasher"
 FOLDER: Final = ROOT / "locale"
 LANGUAGES: Final = tuple(code for code in NAMES if code != "en")
@@ -86,7 +88,7 @@ def sentences() -> Iterator[str]:
     yield from spoken()
     yield from (text for texts in _TEXTS.values() for text in texts.values())
     yield from (text for each in _CAUSES.values() for text in each if text)
-    yield from (each.value for kind in (RunKind, StepName, StepState, MarkKind) for each in kind)
+    yield from (each.value for kind in _SHOWN for each in kind)
     yield from (each.short for each in MarkKind)
     yield from (each.words for each in Verified)
     yield from (

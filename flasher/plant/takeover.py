@@ -47,7 +47,7 @@ from flasher.station.records.heads import ChainHead
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import DEFAULT_LOCK_TIMEOUT_S
 from flasher.station.records.places import lasts
-from flasher.station.records.signatures import SigningKey, fingerprint, is_signed
+from flasher.station.records.signatures import SigningKey, fingerprint
 
 _AT_ONCE: Final = 500
 _TRIES: Final = 20
@@ -116,7 +116,7 @@ class Takeover:
                     for path in _with_log(part):
                         path.unlink(missing_ok=True)
         self.key_locations.heads_file(self.station, found.records_id).append([head], found.key)
-        return TakenOver(self.station, found.number, found.runs, tuple(found.active), aside)
+        return TakenOver(self.station, found.end.number, found.runs, tuple(found.active), aside)
 
     def _make(
         self, central: Central, part: Path, key: bytes | None, now: Callable[[], datetime]
@@ -162,17 +162,17 @@ class Takeover:
         """The signing key, which is put to the other keys of this PC. Raises KeyMissingError."""
         path = self.key_locations.key_file(self.station, copy.records_id)
         key = SigningKey.load(path)
-        if (key is None or key.public != copy.public) and given is not None:
+        if (key is None or key.public != copy.end.key) and given is not None:
             exported = SigningKey.parse(given)
-            if exported.public == copy.public:
+            if exported.public == copy.end.key:
                 if key is not None:
                     path.replace(path.with_name(path.name + ".before"))
                 exported.save(path)
                 key = exported
-        if key is None or key.public != copy.public:
+        if key is None or key.public != copy.end.key:
             raise KeyMissingError(
                 f"The signing key of {printable(self.station)} (fingerprint"
-                f" {fingerprint(copy.public)}) is neither on this PC nor in the export.",
+                f" {fingerprint(copy.end.key)}) is neither on this PC nor in the export.",
                 where=printable(str(path)),
                 cause="the export was made before the key was changed" if given else "",
                 remedy="Make an export on the PC that ran the station last (flasher station"
@@ -219,11 +219,8 @@ class _Copy:
         self._own_id = 0
         self._version: Any = None
         self.key: SigningKey
-        self.number = 0
+        self.end = chain.ChainEnd()
         """The last row that was copied."""
-        self.hash = chain.GENESIS
-        self.public = ""
-        """Public key that signs the next row."""
         self.records_id = ""
         self.station = UUID(int=0)
         self.runs = self.last_run = 0
@@ -235,7 +232,7 @@ class _Copy:
 
     def extend(self, source: Connection, connection: Connection, now: datetime) -> None:
         """Copy the rows after the last one. Raises UsageError, RecordsDamagedError."""
-        if not self.number:
+        if not self.end.number:
             self._begin(source, connection, now)
         with closing(self._rows(source)) as found:
             for some in found:
@@ -247,12 +244,12 @@ class _Copy:
         for path in self._retired(source):
             with closing(ArchiveReader(path).read()) as found:
                 for some in found:
-                    rows = [row for row in some.rows if row["number"] > self.number]
+                    rows = [row for row in some.rows if row["number"] > self.end.number]
                     if some.station == self.station and rows:
                         yield replace(some, rows=rows)
         query = (
             select(chain_row)
-            .where(chain_row.c.station == self.station, chain_row.c.number > self.number)
+            .where(chain_row.c.station == self.station, chain_row.c.number > self.end.number)
             .order_by(chain_row.c.number)
             .execution_options(yield_per=_AT_ONCE)
         )
@@ -264,7 +261,7 @@ class _Copy:
     def _retired(self, source: Connection) -> Sequence[Path]:
         """Files with rows after the last one, oldest first. Raises UsageError."""
         query = select(archive_chain.c.file).where(
-            archive_chain.c.station == self.station, archive_chain.c.last > self.number
+            archive_chain.c.station == self.station, archive_chain.c.last > self.end.number
         )
         names = source.execute(query.order_by(archive_chain.c.last)).scalars().all()
         if names and self._archives is None:
@@ -314,18 +311,9 @@ class _Copy:
         """Check hashes and signatures. Raises RecordsDamagedError, UsageError."""
         for row in rows:
             data = chain.data_of(row["data"])
-            following = chain.key_of(row["event"], data)
-            if following is not None and row["event"] != chain.KEY_ROTATED:
-                self.public = following
-            if (
-                row["number"] != self.number + 1
-                or row["previous_hash"] != self.hash
-                or row["hash"] != chain.row_hash({**row, "run_id": row["run_number"]})
-                or not is_signed(row["hash"], row["signature"], self.public)
-            ):
+            # The run's id at the station is what was signed.
+            if self.end.add({**row, "run_id": row["run_number"]}):
                 raise self._damaged(row["number"])
-            self.number, self.hash = row["number"], row["hash"]
-            self.public = following or self.public
             if row["event"] == chain.CLAIMED:
                 self._claimed[row["run_number"]] = data
             elif row["event"] in chain.ENDINGS:

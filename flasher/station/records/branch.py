@@ -23,7 +23,6 @@ from flasher.station.records.errors import NotFoundError, RecordError, UnprovenE
 from flasher.station.records.files import FileStore
 from flasher.station.records.model import RunState, utc_text
 from flasher.station.records.rows import find_or_insert, insert
-from flasher.station.records.signatures import is_signed
 from flasher.station.records.store import Store
 
 _ROW: Final = (
@@ -72,7 +71,8 @@ def bring_in(
                 remedy="Nothing is to be brought in.",
             )
         contents = chain.contents_of(other, {row["run_id"] for row in rows if row["run_id"]})
-        _check(rows, contents, chain.hash_at(other, store.station, fork), key)
+        last = chain.hash_at(other, store.station, fork) or chain.GENESIS
+        _check(rows, contents, chain.ChainEnd(fork, last, key or ""))
     for content in contents.values():
         for file in content["attachments"]:
             if files.path(file["sha256"]).exists():
@@ -192,31 +192,20 @@ def _rows_after(connection: Connection, station: str, number: int) -> list[dict[
 def _check(
     rows: Sequence[Mapping[str, Any]],
     contents: Mapping[int, Mapping[str, Any]],
-    before: str | None,
-    key: str | None,
+    end: chain.ChainEnd,
 ) -> None:
     """Check hashes, signatures and digests of a branch. Raises UnprovenError."""
     digests = chain.digests_in(contents)
     for row in rows:
-        data = chain.data_of(row["data"])
-        following = chain.key_of(row["event"], data)
-        if following is not None and row["event"] != chain.KEY_ROTATED:
-            key = following
-        stated = data.get("digests", {}) if row["event"] in (chain.CLAIMED, *chain.ENDINGS) else {}
+        has_run = row["event"] in (chain.CLAIMED, *chain.ENDINGS)
+        stated = chain.data_of(row["data"]).get("digests", {}) if has_run else {}
         found = digests.get(row["run_id"], {})
-        if (
-            row["previous_hash"] != before
-            or row["hash"] != chain.row_hash(row)
-            or key is None
-            or not is_signed(row["hash"], row["signature"], key)
-            or any(found.get(part) != digest for part, digest in stated.items())
-        ):
+        if end.add(row) or any(found.get(part) != digest for part, digest in stated.items()):
             raise UnprovenError(
                 f"The records were changed: row {row['number']}, or its run, is not as it was"
                 " signed. Nothing was brought in.",
                 remedy="Find out what was changed: flasher station verify --database FILE.",
             )
-        before, key = row["hash"], following or key
 
 
 def _free_numbers(connection: Connection, contents: Mapping[int, Any]) -> dict[int, int]:

@@ -9,7 +9,9 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from datetime import datetime
+from enum import StrEnum
 from functools import cache
 from typing import Any, Final
 
@@ -20,7 +22,7 @@ from flasher.station.records.heads import ChainHead
 from flasher.station.records.model import AuditEvent, RunState, utc_text
 from flasher.station.records.rows import KEYS, beside_index, find_or_insert, grouped, insert
 from flasher.station.records.schema import audit, station
-from flasher.station.records.signatures import SigningKey
+from flasher.station.records.signatures import SigningKey, is_signed
 from flasher.station.records.triggers import fingerprint_of
 
 GENESIS: Final = "0" * 64
@@ -160,6 +162,39 @@ def key_of(event: str, data: Mapping[str, Any]) -> str | None:
     """The public key that a row introduces; None for other rows."""
     found = data.get("key") if event in _KEYS else None
     return found if isinstance(found, str) else None
+
+
+class RowFault(StrEnum):
+    """What is wrong with an audit row."""
+
+    BROKEN = "the chain is broken: the previous row is missing or changed"
+    CHANGED = "it was changed after it was written"
+    UNSIGNED = "it is not signed with the key of the station"
+
+
+@dataclass
+class ChainEnd:
+    """The end of a chain that is checked row by row."""
+
+    number: int = 0
+    hash: str = GENESIS
+    key: str = ""
+    """Public key that signs the next row."""
+
+    def add(self, row: Mapping[Any, Any]) -> list[RowFault]:
+        """Check the next row; returns its faults. Rows after a changed one are checked as well."""
+        following = key_of(row["event"], data_of(row["data"]))
+        # Only a rotated key is introduced by the one before it.
+        key = self.key if following is None or row["event"] == KEY_ROTATED else following
+        faults = []
+        if (row["number"], row["previous_hash"]) != (self.number + 1, self.hash):
+            faults.append(RowFault.BROKEN)
+        if row["hash"] != row_hash(row):
+            faults.append(RowFault.CHANGED)
+        if not is_signed(row["hash"], row["signature"], key):
+            faults.append(RowFault.UNSIGNED)
+        self.number, self.hash, self.key = self.number + 1, row["hash"], following or key
+        return faults
 
 
 def key_in_force(

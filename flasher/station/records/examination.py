@@ -38,7 +38,6 @@ from flasher.station.records.places import PATIENCE_S, Place, call_all
 from flasher.station.records.proof import contradictions, traces_of_targets
 from flasher.station.records.queries import details_of_content, is_whole
 from flasher.station.records.rows import KEYS, batches, grouped
-from flasher.station.records.signatures import is_signed
 from flasher.station.records.triggers import fingerprint_of, stated_differences
 from flasher.trace.reader import read_trace
 
@@ -356,29 +355,20 @@ class Examiner:
         """Check the rows of one chain after `trail.end`, in order. Yields problems and fills in
         `trail`.
         """
-        before = trail.hash_of(trail.end) or trail.before
-        key = trail.keys[-1] if trail.keys else None
+        key = trail.keys[-1] if trail.keys else ""
+        end = chain.ChainEnd(trail.end, trail.hash_of(trail.end) or trail.before, key)
         shown = printable(trail.station)
         for expected, row in enumerate(rows, trail.end + 1):
             where = f"audit row {expected} of {shown}"
             data = chain.data_of(row["data"])
-            if row["previous_hash"] != before or row["number"] != expected:
-                yield Problem(where, "the chain is broken: the previous row is missing or changed")
-            is_whole = row["hash"] == chain.row_hash(row)
-            if not is_whole:
-                yield Problem(where, "it was changed after it was written")
+            faults = end.add(row)
+            yield from (Problem(where, each.value) for each in faults)
             following = chain.key_of(row["event"], data)
-            if following is not None and row["event"] != chain.KEY_ROTATED:
-                key = following  # which signs itself
-            if key is None or not is_signed(row["hash"], row["signature"], key):
-                yield Problem(where, "it is not signed with the key of the station")
             if following is not None:
-                key = following
-                trail.keys.append(key)
-            before = row["hash"]
-            trail.add(before)
+                trail.keys.append(following)
+            trail.add(row["hash"])
             self._add_progress(1)
-            if not is_whole:
+            if chain.RowFault.CHANGED in faults:
                 continue  # its content is not trusted
             if _table(data.get("schema")):
                 trail.stated = data.get("version"), _table(data.get("schema"))
@@ -598,15 +588,10 @@ def _continued_trail(name: str, since: Examined | None) -> Trail:
 
 def _row_faults(connection: Connection, row: Mapping[Any, Any]) -> Iterator[str]:
     """Faults of one audit row."""
-    number, name = row["number"], row["name"]
-    before = chain.GENESIS if number == 1 else chain.hash_at(connection, name, number - 1)
-    if row["previous_hash"] != before:
-        yield "the chain is broken: the previous row is missing or changed"
-    if row["hash"] != chain.row_hash(row):
-        yield "it was changed after it was written"
-    key = chain.key_in_force(connection, name, number)
-    if key is None or not is_signed(row["hash"], row["signature"], key):
-        yield "it is not signed with the key of the station"
+    number, name = row["number"] - 1, row["name"]
+    before = chain.hash_at(connection, name, number) if number else chain.GENESIS
+    key = chain.key_in_force(connection, name, row["number"])
+    return (each.value for each in chain.ChainEnd(number, before or "", key or "").add(row))
 
 
 def _schema_of(connection: Connection, name: str) -> Iterator[Problem]:
