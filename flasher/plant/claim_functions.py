@@ -17,6 +17,7 @@ from typing import Final
 
 from flasher.plant.functions import DEFINER, REFUSED
 from flasher.station.records.model import PLANT_CLAIM, RunKind, StepName
+from flasher.station.records.server import ServerLock
 
 _OPEN_MAX: Final = 1000
 """Claims of a station that have not expired; with 64 sockets it has a fraction of that."""
@@ -39,7 +40,8 @@ DECLARE
     other plant_claim;
     now timestamptz;
 BEGIN
-    PERFORM pg_advisory_xact_lock(hashtextextended(of_part || E'\\x1f' || of_serial, 7053));
+    PERFORM pg_advisory_xact_lock(
+        hashtextextended(of_part || E'\\x1f' || of_serial, {ServerLock.UNIT:d}));
     -- After the lock: another PC may have taken the station over, and run the unit, meanwhile.
     SELECT * INTO mine FROM plant_station p WHERE p.role = session_user;
     IF mine.station IS NULL OR mine.records_id <> of_records THEN

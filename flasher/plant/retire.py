@@ -38,12 +38,12 @@ from flasher.station.records.chain import GENESIS
 from flasher.station.records.database import Database
 from flasher.station.records.errors import RecordError, RecordsDamagedError
 from flasher.station.records.model import DUPLICATES, FLASH, Problem, StepName
+from flasher.station.records.server import ServerLock
 
 LIMIT_S: Final = 3600.0
 """Time limit of one statement."""
 _FILES_MAX: Final = 1000
 """Files of one month: later ones hold what arrived late."""
-_LOCK: Final = 7054
 
 
 @dataclass(frozen=True)
@@ -232,7 +232,7 @@ class Retirement:
     ) -> None:
         """Delete what is in the file, and record the file, in one transaction."""
         with self._central.writing() as connection:
-            connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _LOCK})
+            ServerLock.RETIRING.hold(connection)
             for each in chains:
                 if last_archived(connection, each.station).last != each.first - 1:
                     raise RecordError(

@@ -27,6 +27,7 @@ from flasher.plant.schema import (
 from flasher.protocol.text import printable
 from flasher.station.records import schema as station_schema
 from flasher.station.records.model import utc_text
+from flasher.station.records.server import ServerLock
 
 STATIONS: Final = "flasher_stations"
 """Role with the rights of a station; each station's own role is a member."""
@@ -39,7 +40,6 @@ DELIVERERS: Final = "flasher_deliverers"
 _GROUPS: Final = (STATIONS, READERS, PUBLISHERS, DELIVERERS)
 MIGRATIONS: Final = "flasher.plant:migrations"
 _CHANGE_LIMIT_S: Final = 3600.0
-_LOCK: Final = 7053
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def setup(
         closing(Central(url, statement_limit_s=_CHANGE_LIMIT_S)) as central,
         central.writing() as connection,
     ):
-        connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _LOCK})
+        ServerLock.SETUP.hold(connection)
         # The functions prefer the records' tables to temporary ones.
         connection.execute(
             text(

@@ -30,6 +30,7 @@ from flasher.station.records.errors import Refusal as RefusalReason
 from flasher.station.records.files import FileStore
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import AuditEvent, RunId, RunState, UnitState
+from flasher.station.records.server import ServerLock
 from flasher.station.records.signatures import SigningKey
 from flasher.station.records.store import Store
 from tests.plant.factory import READER, Plant, Sender
@@ -352,7 +353,8 @@ def test_a_pc_that_waits_for_the_unit_while_it_is_taken_over_does_not_claim_it(
     old = Line(plant, "line-2", sender)
     old.claims.tend()
     lock = (
-        "SELECT pg_advisory_xact_lock(hashtextextended('BAT-36' || E'\\x1f' || 'W2605002', 7053))"
+        "SELECT pg_advisory_xact_lock(hashtextextended('BAT-36' || E'\\x1f' || 'W2605002',"
+        f" {ServerLock.UNIT:d}))"
     )
     waiting = "SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND NOT granted"
     with ThreadPoolExecutor() as pool, plant.connect() as spare:

@@ -21,13 +21,12 @@ from sqlalchemy import (
     Text,
     inspect,
     select,
-    text,
 )
 
 from flasher.station.records.database import Location
 from flasher.station.records.errors import mapped
 from flasher.station.records.heads import ChainHead
-from flasher.station.records.server import make_engine
+from flasher.station.records.server import ServerLock, make_engine
 from flasher.station.records.signatures import SigningKey
 
 _PATIENCE_S: Final = 5.0
@@ -93,7 +92,7 @@ class ServerHeads:
         with self._place.connected(writes=True) as connection:
             if not _is_there(connection):
                 # Two stations may create the table at the same time.
-                connection.execute(text("SELECT pg_advisory_xact_lock(7052, 7052)"))
+                ServerLock.HEADS.hold(connection)
                 if not _is_there(connection):
                     _metadata.create_all(connection)
                     connection.exec_driver_sql(_RULES)

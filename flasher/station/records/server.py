@@ -6,11 +6,12 @@ Needs the extra `plant`; imported only when a server is configured.
 from __future__ import annotations
 
 import math
+from enum import IntEnum
 from typing import Any, Final
 
 import psycopg
 from psycopg.pq import TransactionStatus
-from sqlalchemy import URL, Engine, create_engine, event
+from sqlalchemy import URL, Connection, Engine, create_engine, event, text
 
 STATEMENT_LIMIT_S: Final = 30.0
 """Time limit of the server for one statement, not counting waits for locks."""
@@ -20,6 +21,23 @@ _DEAD_AFTER_S: Final = 25.0
 """Time after which a computer that lost power or network is detected: the first probe after 10 s,
 two more, 5 s apart, and the timeout of the last."""
 _PROBES: Final = {"keepalives_idle": 10, "keepalives_interval": 5, "keepalives_count": 3}
+
+
+class ServerLock(IntEnum):
+    """Advisory locks; each is one for a whole database."""
+
+    HEADS = 7052
+    """The table of chain heads is made."""
+    SETUP = 7053
+    """The tables of a plant are made or upgraded."""
+    RETIRING = 7054
+    """A retired month is deleted."""
+    UNIT = 7055
+    """A unit is claimed: seed of the hash of its part and serial number."""
+
+    def hold(self, connection: Connection) -> None:
+        """Wait for the lock; it ends with the transaction."""
+        connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": self.value})
 
 
 class _Connection(psycopg.Connection[Any]):
