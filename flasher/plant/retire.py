@@ -35,7 +35,6 @@ from flasher.plant.schema import (
 from flasher.protocol.text import printable
 from flasher.station.records import schema
 from flasher.station.records.chain import GENESIS
-from flasher.station.records.database import Database
 from flasher.station.records.errors import RecordError, RecordsDamagedError
 from flasher.station.records.model import DUPLICATES, FLASH, Problem, StepName
 from flasher.station.records.server import ServerLock
@@ -96,12 +95,10 @@ class Retirement:
     def __init__(
         self,
         central: Central,
-        database: Database,
         folder: Path,
         progress: Callable[[int, int], None] = lambda _done, _total: None,
     ) -> None:
-        self._central, self._database = central, database
-        self._folder, self._progress = folder, progress
+        self._central, self._folder, self._progress = central, folder, progress
         self._done = self._total = 0
         # What another version keeps beside a run would be left, or be lost.
         central.check_schema()
@@ -221,7 +218,7 @@ class Retirement:
         def show(done: int, _total: int) -> None:
             self._progress(rows + done, self._total)
 
-        return ArchiveExaminer(self._database, path, chains, show).examine_file()
+        return ArchiveExaminer(self._central, path, chains, show).examine_file()
 
     def _count(self, rows: int) -> None:
         self._done += rows

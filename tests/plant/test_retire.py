@@ -56,8 +56,8 @@ def three_months(plant: Plant, sender: Sender) -> Iterator[Plant]:
 @contextmanager
 def retirement(plant: Plant, role: str = OWNER) -> Iterator[Retirement]:
     url = plant.url(role)
-    with closing(Central(url)) as central, closing(opened(plant)) as store:
-        yield Retirement(central, store.database, plant.folder / "archive")
+    with closing(Central(url)) as central:
+        yield Retirement(central, plant.folder / "archive")
 
 
 def retired(plant: Plant, before: str, *, with_problems: bool = False) -> list[RetiredMonth]:

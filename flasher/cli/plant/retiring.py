@@ -9,8 +9,6 @@ from pathlib import Path
 from flasher.cli.bar import Bar
 from flasher.cli.output import Output, byte_count, counted
 from flasher.cli.plant.documents import PlantRetireDocument
-from flasher.cli.plant.reading import records_of_plant
-from flasher.cli.station.place import open_to_read
 from flasher.plant.archive import month_after
 from flasher.plant.central import Central
 from flasher.plant.retire import (
@@ -20,7 +18,6 @@ from flasher.plant.retire import (
     Retirement,
     month_before,
 )
-from flasher.plant.store import PlantStore
 from flasher.protocol.text import printable
 
 
@@ -41,10 +38,9 @@ def retire(
     look = {"unit": " rows", "desc": "retiring", "unit_scale": True}
     with (
         closing(Central(url, statement_limit_s=LIMIT_S)) as central,
-        closing(open_to_read(records_of_plant(url), PlantStore)) as store,
         Bar(output, **look) as bar,
     ):
-        work = Retirement(central, store.database, folder, bar.move_to)
+        work = Retirement(central, folder, bar.move_to)
         if dry_run:
             due = work.months(before)
             for each in due:
