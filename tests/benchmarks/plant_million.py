@@ -6,8 +6,9 @@
 The folder holds a PostgreSQL server that waits for its disk; it is filled once, and measured again
 by each call. The runs are rows that the server copies from one run that a real station sent: 30
 stations of 4 sockets, 10,000 runs a day up to now, every tenth unit bad at first, 8 steps, 3
-measurements and 2 writes each. Their audit rows have the right size, but are not signed, and there
-are no traces. `--more` runs are then sent by the forwarder of a station of its own.
+measurements and 2 writes each. They are handed over to two receivers: one refused the first 200
+runs, the last tenth waits for the other. Their audit rows have the right size, but are not signed,
+and there are no traces. `--more` runs are then sent by the forwarder of a station of its own.
 """
 
 from __future__ import annotations
@@ -102,6 +103,15 @@ INSERT INTO chain_row (station, number, at, event, run_number, data, previous_ha
     100 + (n.socket_id - 1001) / {of_one} + 1, n.id
     FROM new n, chain_row c, LATERAL (SELECT (c.event <> 'claimed')::int AS is_end) k
     WHERE c.run_id = (SELECT id FROM t);
+INSERT INTO plant_receiver (name) VALUES ('mes'), ('broker');
+INSERT INTO plant_delivery (receiver, station, number, state, attempts, sent_at, answered_at,
+    answer, job, row_id) SELECT 'mes', c.station, c.number,
+    CASE WHEN c.run_number <= 200 THEN 'refused' ELSE 'confirmed' END, 1, now(), now(),
+    'HTTP 200', c.id, c.id FROM chain_row c JOIN new n ON n.id = c.run_id
+    WHERE c.content IS NOT NULL;
+INSERT INTO plant_delivery (receiver, station, number, state, job, row_id) SELECT 'broker',
+    c.station, c.number, CASE WHEN c.run_number > {runs} * 0.9 THEN 'waiting' ELSE 'confirmed' END,
+    c.id, c.id FROM chain_row c JOIN new n ON n.id = c.run_id WHERE c.content IS NOT NULL;
 """
 _INDEXES = """
 SELECT indexname, indexdef FROM pg_indexes WHERE schemaname = 'public'
@@ -152,7 +162,9 @@ def _measure(url: str, folder: Path, *, with_sums: bool) -> None:
             ("/stations", {}), ("/yield", {}), ("/yield", of_one),
             ("/yield", {"from": "2020-01-01"}), ("/images", {}), ("/runs", {}),
             ("/runs", of_one), ("/times", {}), ("/measurements", {}),
-            ("/measurements", of_one), ("/audit", {}),
+            ("/measurements", of_one), ("/audit", {}), ("/deliveries", {}),
+            ("/deliveries", {"state": "refused"}), ("/deliveries", {"state": "waiting"}),
+            ("/deliveries", {"to": f"{datetime.now(UTC) - timedelta(days=50):%Y-%m-%d}"}),
         ):  # fmt: skip
             question = Question(path, fields)
             first_s, _ = _timed(partial(pages.answer, question))
