@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 from uuid import UUID
@@ -14,6 +14,7 @@ from sqlalchemy import Connection, text
 
 from flasher.errors import UsageError
 from flasher.plant.central import Central
+from flasher.plant.claim_list import RELEASED_MARK, released_runs
 from flasher.plant.queue import TASK
 from flasher.protocol.text import printable
 from flasher.station.records.errors import NotFoundError
@@ -252,5 +253,8 @@ def document_of(connection: Connection, station: UUID, number: int, schema: int)
     key = key_of(station, number)
     run_id = connection.execute(_RUN_OF, {"station": station, "number": number}).scalar()
     for details in details_of(connection, run.c.id == run_id):
-        return RunDocument(schema, key, station, number, details)
+        ended = details.run
+        if run_id in released_runs(connection):
+            ended = replace(ended, duplicates=RELEASED_MARK)
+        return RunDocument(schema, key, station, number, replace(details, run=ended))
     raise NotFoundError(f"There is no run with the key {key}.")

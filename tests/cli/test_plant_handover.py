@@ -178,6 +178,16 @@ def test_what_was_retired_is_listed_up_to_a_limit(
     ]
 
 
+def test_no_more_is_listed_than_the_limit(desk: Desk) -> None:
+    with closing(Central(desk.plant.url(COURIER))) as central:
+        Deliveries(central).register(["mes", "erp"])
+    desk.sender.bench.make()
+    desk.sender.send()
+    for limit in (1, 2):
+        listed = desk.run("deliveries", "--limit", limit, role=READER).document
+        assert len(listed["deliveries"]) == limit
+
+
 def test_a_receiver_that_is_stopped_gets_no_more(desk: Desk) -> None:
     desk.deliver()
     desk.run("deliveries", "--stop", "mes")

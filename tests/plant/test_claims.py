@@ -23,6 +23,7 @@ from flasher.plant.claim_list import (
     releases_of,
 )
 from flasher.plant.claims import LEASE_S, PlantClaims, _Own
+from flasher.plant.deliveries import document_of
 from flasher.plant.setup import role_of, setup
 from flasher.plant.store import PlantStore
 from flasher.station.gate import Gate
@@ -473,6 +474,9 @@ def test_the_model_of_the_virtual_stations_answers_like_postgresql(
 # -- a station that does not return ----------------------------------------------------------------
 
 
+ENDS = "SELECT station, number FROM chain_row WHERE content IS NOT NULL"
+
+
 def released(plant: Plant, **chosen: str) -> int:
     with closing(Central(plant.url())) as central:
         return release(central, ClaimFilter(**chosen), "its disk is broken")
@@ -515,7 +519,13 @@ def test_a_run_that_arrives_after_its_claim_was_released_is_marked(
     assert arrived == runs["line-2"].run_id
     with closing(Central(plant.url(READER))) as central, central.reading() as connection:
         (old,) = releases_of(connection, ClaimFilter())
+        documents = [
+            document_of(connection, station, number, 2).run.run
+            for station, number in plant.rows(ENDS)
+        ]
         assert claims_of(connection, ClaimFilter()) == []
+    marks = {each.station: each.duplicates for each in documents}
+    assert marks == {"line-2": RELEASED_MARK, "line-3": CHECKED}, "as receivers get them"
     facts = (old.station, old.serial, old.reason, old.released_by, old.run_id, old.outcome)
     assert facts == ("line-2", SERIAL, "its disk is broken", OWNER, arrived, "PASS")
     assert run == gone.bench.store.read.table()[0].run_id

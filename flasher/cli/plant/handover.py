@@ -98,7 +98,7 @@ def deliveries(
                 raise unknown_receiver(str(chosen.receiver))
             size = None if resend else limit
             # Without a receiver there may be no queue to read.
-            rows = deliveries_of(connection, chosen, size=size).rows if known else ()
+            rows = deliveries_of(connection, chosen, size=size).rows[:size] if known else ()
         if resend:
             for name in dict.fromkeys(row.receiver for row in rows):
                 found.send_again(name, [row.key for row in reversed(rows) if row.receiver == name])
