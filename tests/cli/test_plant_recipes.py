@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import sys
 from collections.abc import Callable, Iterator
@@ -59,7 +60,8 @@ class People:
     def __init__(self, scans: Callable[[People], Iterator[str]]) -> None:
         self._scans = scans
         self._events: SimpleQueue[dict[str, Any]] = SimpleQueue()
-        self._line = ""
+        self._line = self.label = ""
+        self._offered: list[dict[str, Any]] = []
 
     def write(self, text: str) -> int:
         *lines, self._line = (self._line + text).split("\n")
@@ -76,50 +78,78 @@ class People:
     def __iter__(self) -> Iterator[str]:
         return self._scans(self)
 
-    def see(self, name: str, **values: object) -> dict[str, Any]:
+    def see(self, name: str, **values: object) -> None:
         """Wait for the next event of this name and these values."""
         while True:
-            event = self._events.get(timeout=_LIMIT_S)
+            event = self._next()
             if event.get("event") == name and values.items() <= event.items():
-                return event
+                return
+
+    def offered(self) -> dict[str, Any]:
+        """The recipe that the plant offers, when it does."""
+        while not self._offered:
+            self._next()
+        return self._offered[0]
+
+    def _next(self) -> dict[str, Any]:
+        event = self._events.get(timeout=_LIMIT_S)
+        self._offered = event.get("offered", self._offered)
+        self.label = event.get("label", self.label)
+        return event
 
 
-def test_a_published_recipe_is_fetched_approved_and_used_from_the_next_unit_on(
-    flasher: Flasher, plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("flasher.plant.process._END_S", 60.0)
+@pytest.fixture
+def station(
+    plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[str], tuple[str | Path, ...]]:
+    """Words of the command that runs a station of a plant with this URL."""
     monkeypatch.setattr("flasher.cli.station.run.LAUNCH", ThreadPort)
     with plant.connect() as admin:
         admin.execute(f"CREATE ROLE {PUBLISHER} LOGIN PASSWORD '{PASSWORD}'".encode())
         admin.execute(f"GRANT {PUBLISHERS} TO {PUBLISHER}".encode())
-    centre, station = tmp_path / "centre", tmp_path / "station"
-    for folder in (centre, station):
-        folder.mkdir()
-    published = write_recipe(centre, USUAL.replace('revision = "4"', 'revision = "5"'))
-    words = ("--station", "line-2", "--database", plant.url(PUBLISHER), "--json")
+    folder = tmp_path / "station"
+    folder.mkdir()
+    file, recipe = folder / "station.toml", write_recipe(folder, USUAL)
+    (folder / "badges.toml").write_text(BADGES, encoding="utf-8")
+
+    def words(url: str) -> tuple[str | Path, ...]:
+        file.write_text(STATION.format(plant=url), encoding="utf-8")
+        return "station", "run", "--recipe", recipe, "--sockets", file, "--mock-speed", "0"
+
+    return words
+
+
+def test_a_published_recipe_is_fetched_approved_and_used_from_the_next_unit_on(
+    flasher: Flasher,
+    plant: Plant,
+    station: Callable[[str], tuple[str | Path, ...]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    published = write_recipe(tmp_path, USUAL.replace('revision = "4"', 'revision = "5"'))
+    database = ("--database", plant.url(PUBLISHER))
+    words = ("--station", "line-2", *database, "--json")
     digest = flasher("plant", "publish", published, *words).document["digest"]
-    local = write_recipe(station, USUAL)
-    file = station / "station.toml"
-    file.write_text(STATION.format(plant=plant.url("flasher_line_2")), encoding="utf-8")
-    (station / "badges.toml").write_text(BADGES, encoding="utf-8")
     serials = []
 
     def scans(people: People) -> Iterator[str]:
         yield "BADGE-1"
         for is_new in (False, True):
             if is_new:
-                (offer,) = people.see("RecipesOffered")["offered"]
-                yield from ("BADGE-2", offer["scan"])
+                scan = people.offered()["scan"]
+                yield from ("BADGE-2", scan)
                 people.see("RecipeChanged", socket="A", digest=digest)
-            serials.append(people.see("UnitArrived")["label"])
+            people.see("UnitArrived")
+            serials.append(people.label)
             yield serials[-1]
             people.see("RunEnded", outcome="pass")
 
     people = People(scans)
     with monkeypatch.context() as patch:
+        patch.setattr("flasher.plant.process._END_S", 60.0)
         patch.setattr(sys, "stdin", people)
         patch.setattr(sys, "stdout", people)
-        run = flasher("station", "run", "--recipe", local, "--sockets", file, "--mock-speed", "0")
+        run = flasher(*station(plant.url("flasher_line_2")))
     assert run.code == ExitCode.OK, run.err
     with closing(plant.store()) as store:
         runs = [life.runs[-1].run for each in serials for life in store.read.units(each)]
@@ -132,7 +162,11 @@ def test_a_published_recipe_is_fetched_approved_and_used_from_the_next_unit_on(
     assert (approval["by"], approval["published_by"]) == ("Kim", PUBLISHER)
     (status,) = plant.status().recipes
     assert (status.socket, status.digest) == ("A", digest)
-    database = ("--database", plant.url(PUBLISHER))
+    monkeypatch.setattr("flasher.plant.process._END_S", 0.0)  # nothing to send, and nowhere
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    again = flasher(*station("postgresql://x@127.0.0.1:1/plant"))
+    assert json.loads(again.out.splitlines()[-1])["revision"] == "5", "without the server"
+    assert "--ignore-approved" in again.err
     withdrawn = flasher("plant", "withdraw", digest[:12], "--reason", "wrong limits", *database)
     assert withdrawn.out.splitlines()[0].endswith(f"{digest[:16]}: wrong limits")
     listed = flasher("plant", "recipes", *database).out.splitlines()

@@ -109,6 +109,11 @@ def run(
         ExitStack() as stack,
     ):
         recipes = recipes_of(options, config, sockets, store, local, day)
+        if local is not None and any(each is not local for each in recipes.values()):
+            output.progress(
+                f"The plant's approved recipes are used instead of {printable(str(local.path))}"
+                " (--ignore-approved: use it)."
+            )
         recipe = recipes[sockets[0].config.name]
         crew = crew_of(options, config, recipe.recipe.serial_number)
         session = _Session(
