@@ -26,7 +26,7 @@ _SHOWN: Final = (
     "station/continuity", "station/recipe", "station/power", "station/sealed", "station/stories",
     "station/unit_*", "station/worker", "station/records/errors", "station/records/examination",
     "station/records/files", "station/records/proof", "station/records/queries",
-    "web/archive", "web/bench", "web/bench_bike",
+    "web/archive", "web/bench", "web/bench_backup", "web/bench_bike",
     "web/bench_compare", "web/series", "web/supervisor", "cli/look/info", "cli/upgrade/bench_page",
 )  # fmt: skip
 _NOT_SHOWN: Final = (

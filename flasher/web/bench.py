@@ -8,18 +8,18 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from queue import Empty, Queue
-from typing import Final, Protocol, TypeVar
+from typing import Final, TypeVar
 
 from flasher import events
-from flasher.api import Connection, DeviceInfo, Job, Result, prepare, refusal
+from flasher.api import Connection, DeviceInfo, Job, prepare, refusal
 from flasher.bike import SetImage, check_same_battery, open_bike_set, serial_number
-from flasher.driver import Tap, drive
+from flasher.driver import Tap
 from flasher.errors import (
     ErrorCode,
     FlasherError,
@@ -28,7 +28,6 @@ from flasher.errors import (
     UsageError,
     WrongDeviceError,
 )
-from flasher.history import Flash
 from flasher.host.event_text import progress_line, warning_text
 from flasher.host.identity import (
     OF_STATE,
@@ -39,31 +38,24 @@ from flasher.host.identity import (
     new_version,
 )
 from flasher.host.outcome import AGAIN
-from flasher.host.query import memory_bytes
 from flasher.i18n import Text, text, with_value
 from flasher.image.image import Image
 from flasher.image.sample import is_sample, sample_error
 from flasher.kept_settings import settings_of
 from flasher.procedures import nothing_received_error
-from flasher.protocol.contents import Memory, RunningInformation, VersionInformation
-from flasher.protocol.spec import BMS, TARGETS, Dialect, Target
+from flasher.protocol.contents import RunningInformation, VersionInformation
+from flasher.protocol.spec import BMS, TARGETS, Target
 from flasher.protocol.text import printable
 from flasher.release.places import SUFFIX as RELEASE_SUFFIX
 from flasher.report.base import visible
-from flasher.settings.area import Area, area_of_image, area_of_profile
-from flasher.settings.profile import Profile
-from flasher.trace.decoder import BusEvent
-from flasher.trace.watcher import MessageTable, Pulse, Watcher
 from flasher.way_back import images_here
+from flasher.web.bench_backend import BenchBackend
 from flasher.web.bench_state import (
     Activity,
     Adapter,
     BenchState,
-    BusWatch,
     Done,
     Offer,
-    Saved,
-    SeenMessage,
     SessionEntry,
 )
 from flasher.web.feed import Feed
@@ -73,8 +65,6 @@ TURN_S: Final = 0.2
 SILENCE_LIMIT_S: Final = 5.0
 """Time without a report before pages show the bench as silent; opening an adapter takes seconds."""
 NOTES_KEPT: Final = 12
-WATCH_TURN_S: Final = 0.5
-"""Refresh interval of the bus view, slow enough to read."""
 SUBJECT: Final = "bench"
 _AGAIN: Final = text("Start again with the adapter.")
 RESCUE: Final = text("Rescue this device.")
@@ -82,64 +72,6 @@ T = TypeVar("T")
 Order = Callable[["BenchController"], object]
 """A function that the bench's own thread calls."""
 _LOG: Final = logging.getLogger("flasher.web")
-
-
-# -- the machine -----------------------------------------------------------------------------------
-
-
-@dataclass
-class UpgradeEnding:
-    """End of an upgrade: result or error, bundle and entry in the history."""
-
-    result: Result | None
-    error: FlasherError | None
-    bundle: Path | None
-    warning: str = ""
-    """Reason why the history lacks the upgrade; "" if it has it."""
-
-
-class BenchBackend(Protocol):
-    """Access to the devices. Methods raise FlasherError."""
-
-    dialect: Dialect
-
-    def adapters(self, cancelled: Callable[[], bool]) -> Sequence[Adapter]: ...
-    def use(self, adapter: Adapter) -> None: ...
-    def profile(self, target: Target) -> Profile: ...
-    def bitrate_bps(self, adapter: Adapter) -> int: ...
-    def is_physical(self, adapter: Adapter) -> bool: ...
-    def images(self) -> Sequence[Path]: ...
-    def sets(self) -> Sequence[Path]: ...
-    def dropped(self) -> Sequence[str]: ...
-    def unfinished(self) -> Flash | None: ...
-    def use_folder(self, path: str) -> None: ...
-    def connect(self, adapter: Adapter, *, asks: bool = True) -> AbstractContextManager[Connection]:
-        """Open an adapter. With `asks` False, nothing may be sent."""
-
-    def model_area(self) -> Area | None:
-        """Memory area of a device model; None for real devices."""
-
-    def back_up(
-        self,
-        adapter: Adapter,
-        area: Area | None,
-        *,
-        on_event: Callable[[object], None],
-        cancelled: Callable[[], bool],
-    ) -> Saved:
-        """Save the battery's answers and the memory of an area to a new file."""
-
-    def upgrade(
-        self,
-        adapter: Adapter,
-        job: Job,
-        connect: Callable[[], AbstractContextManager[Connection]],
-        *,
-        keeps_settings: bool,
-        on_event: Callable[[object], None],
-        cancelled: Callable[[], bool],
-    ) -> UpgradeEnding:
-        """Run an upgrade to its end and store its records; `connect` opens the adapter."""
 
 
 class BenchController:
@@ -312,7 +244,7 @@ class BenchController:
 
     def use_adapter(self, name: str) -> None:
         """Open an adapter and look for devices."""
-        adapter = _known({each.name: each for each in self.state.adapters}, name)
+        adapter = known({each.name: each for each in self.state.adapters}, name)
         self.backend.use(adapter)
         marked = tuple(replace(each, was_last=each == adapter) for each in self.state.adapters)
         self.show(
@@ -360,7 +292,7 @@ class BenchController:
         if not name:
             self.show(target=None, offers=(), offer=None, done=None, waived=frozenset())
             return
-        target = _known(TARGETS, name)
+        target = known(TARGETS, name)
         has_settings = bool(settings_of(target, self.backend.dialect))
         self.show(
             target=target, offer=None, done=None, waived=frozenset(),
@@ -379,7 +311,7 @@ class BenchController:
             self.judge()
             return
         fitting = {offer.name: offer for offer in self.state.offers if not offer.refusal}
-        offer = _known(fitting, name)
+        offer = known(fitting, name)
         self._last_image = offer.path
         self.show(offer=offer, done=None)
 
@@ -442,7 +374,7 @@ class BenchController:
         refused = {each.name: each.refusal for each in self.state.offers if each.refusal}
         if done is not None and done.error is not None:
             refused = {done.offer.name: done.error}
-        error = _known(refused, name)
+        error = known(refused, name)
         if not waiver or error.waiver != waiver:
             raise UsageError(
                 "That check has not refused this image; nothing was waived.", remedy="Look again."
@@ -450,72 +382,6 @@ class BenchController:
         self.show(done=None, waived=self.state.waived | {(name, waiver)})
         self.judge()
         self._select(lambda offer: offer.name == name)
-
-    def watch(self) -> None:
-        """Show the bus traffic until stopped, without sending."""
-        board = MessageTable()
-        messages = troubles = 0
-        began_s = 0.0
-
-        def happened(event: object) -> None:
-            nonlocal messages, troubles
-            if isinstance(event, BusEvent):
-                messages += 1
-                troubles += event.is_trouble
-                board.add(event)
-            elif isinstance(event, Pulse):
-                now = event.at
-                rows = tuple(
-                    SeenMessage(
-                        line.event, frozenset(line.changed(now)), line.count, line.rate_hz(now)
-                    )
-                    for line in board.lines()
-                )
-                self.show(watched=BusWatch(now - began_s, messages, troubles, rows))
-
-        self.show(doing=Activity.WATCHING, watched=BusWatch(0.0, 0, 0, ()))
-        watcher = Watcher(pulse_s=WATCH_TURN_S, dialect=self.backend.dialect)
-        with self.connected(asks=False) as connection:
-            began_s = connection.clock.now()
-            drive(
-                watcher, connection.link, connection.clock,
-                on_event=happened, cancelled=self.cancelled,
-            )  # fmt: skip
-
-    def find_areas(self) -> None:
-        """Find memory areas for a backup in the images that fit: reading an address that does not
-        exist may crash a device.
-        """
-        self.adapter()
-        self.show(doing=Activity.JUDGING, areas=None)
-        found = [area_of_profile(self.backend.profile(BMS)) or self.backend.model_area()]
-        for path in self.backend.images():
-            if self.cancelled():
-                return
-            with suppress(FlasherError):
-                found.append(area_of_image(self.job(path, BMS).plan.image))
-        self.show(areas=tuple(each for each in found if each is not None))
-
-    def leave_backup(self) -> None:
-        self.show(areas=None)
-
-    def back_up(self, source: str) -> None:
-        """Save the battery's answers and the memory of this area; "" for no memory."""
-        areas = {area.source: area for area in self.state.areas or ()}
-        area = _known(areas, source) if source else None
-
-        def happened(event: object) -> None:
-            match event:
-                case events.QueryAnswered(content=Memory() as piece):
-                    self.show(saved_bytes=self.state.saved_bytes + len(memory_bytes(piece)))
-
-        self.show(doing=Activity.SAVING, saved=None, saved_bytes=0)
-        self.show(
-            saved=self.backend.back_up(
-                self.adapter(), area, on_event=happened, cancelled=self.cancelled
-            ),
-            areas=None,
-        )
 
     def judged(self, path: Path) -> Offer:
         """Check an image for the selected device."""
@@ -835,7 +701,7 @@ def changed_error(offer: Offer) -> ImageError:
     )
 
 
-def _known(things: Mapping[str, T], name: str) -> T:
+def known(things: Mapping[str, T], name: str) -> T:
     """Look up a name. Raises UsageError for an entry that no longer exists."""
     found = things.get(name)
     if found is None:

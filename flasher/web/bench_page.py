@@ -29,9 +29,11 @@ from flasher.settings.profile import FILE_NAME as PROFILE
 from flasher.trace.decoder import Field, content_fields
 from flasher.translation import Translator
 from flasher.web.bench import BenchController
+from flasher.web.bench_backup import back_up, find_areas, leave_backup
 from flasher.web.bench_bike import upgrade_bike
 from flasher.web.bench_compare import compare
 from flasher.web.bench_state import BenchState, Done
+from flasher.web.bench_watch import watch
 from flasher.web.pages import Pages, streamed
 from flasher.web.series import SHOWN_S, take_next_bikes
 
@@ -47,11 +49,11 @@ _ORDERS: Final[Mapping[str, tuple[Callable[..., None], tuple[str, ...]]]] = {
     "adapters": (BenchController.find_adapters, ()),
     "adapter": (BenchController.use_adapter, ("name",)),
     "look": (BenchController.look, ()),
-    "watch": (BenchController.watch, ()),
-    "areas": (BenchController.find_areas, ()),
+    "watch": (watch, ()),
+    "areas": (find_areas, ()),
     "compare": (compare, ()),
-    "backup": (BenchController.back_up, ("source",)),
-    "no-backup": (BenchController.leave_backup, ()),
+    "backup": (back_up, ("source",)),
+    "no-backup": (leave_backup, ()),
     "target": (BenchController.choose_target, ("name",)),
     "images": (BenchController.judge, ()),
     "settings": (BenchController.keep_settings, ("keep",)),

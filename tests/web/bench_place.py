@@ -21,10 +21,10 @@ from flasher.cli.values import IMAGE_SUFFIXES, TRACE_SUFFIXES
 from flasher.image.release import Release
 from flasher.protocol.spec import BMS
 from flasher.settings.manifest import manifest_path, to_toml
-from flasher.web import bench
 from flasher.web.archive import PAGES as KEPT
 from flasher.web.archive import Archive
 from flasher.web.bench import BenchController, Order
+from flasher.web.bench_backend import UpgradeEnding
 from flasher.web.bench_compare import watch_compared
 from flasher.web.bench_page import BenchPage, Shelf, upload_limit
 from flasher.web.bench_state import Adapter, BenchState
@@ -71,7 +71,7 @@ class HeldBikes(VirtualBikes):
         keeps_settings: bool,
         on_event: Callable[[object], None],
         cancelled: Callable[[], bool],
-    ) -> bench.UpgradeEnding:
+    ) -> UpgradeEnding:
         def held(event: object) -> None:
             on_event(event)
             self.hold(event)

@@ -40,8 +40,10 @@ from flasher.protocol.fields import WireText
 from flasher.protocol.spec import BMS, WELLING, Target
 from flasher.translation import translator
 from flasher.web.bench import BenchController, Order
+from flasher.web.bench_backup import back_up, find_areas
 from flasher.web.bench_page import as_it_is_now, battery_answers, facts
 from flasher.web.bench_state import Activity, BenchState, Done
+from flasher.web.bench_watch import watch
 from flasher.web.pages import Pages
 from flasher.web.virtual_bike import BikeFault
 from tests.end_to_end.stage import NEW, OLD, image_of
@@ -550,9 +552,9 @@ def test_while_it_does_something_it_takes_no_other_order(place: BenchPlace) -> N
     [
         BenchController.look,
         BenchController.judge,
-        BenchController.watch,
-        BenchController.find_areas,
-        order(BenchController.back_up, ""),
+        watch,
+        find_areas,
+        order(back_up, ""),
         order(BenchController.choose_target, "bms"),
         order(BenchController.use_adapter, "none"),
         BenchController.rescue_it,
@@ -582,7 +584,7 @@ def test_what_is_said_on_the_bus_is_shown_until_it_is_stopped(
             place.bench.stop()
 
     monkeypatch.setattr(place.bench.feed, "put", put)
-    state = place.do(BenchController.watch)
+    state = place.do(watch)
     assert state.trouble is None
     assert state.watched is not None
     assert {each.doing for each in looks} == {Activity.WATCHING, Activity.NOTHING}
@@ -606,7 +608,7 @@ def test_the_bus_is_watched_in_the_time_of_its_messages(
             place.bench.stop()
 
     monkeypatch.setattr(place.bench.feed, "put", stop_after_a_minute)
-    watched = place.do(BenchController.watch).watched
+    watched = place.do(watch).watched
     assert watched is not None
     row = watched.board[0]
     assert row.rate_hz is not None
@@ -617,8 +619,8 @@ def test_a_bus_that_fails_while_it_is_watched_says_so(
     place: BenchPlace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     place.do(order(BenchController.use_adapter, BikeFault.NONE.value))
-    monkeypatch.setattr("flasher.web.bench.drive", _lost)
-    state = place.do(BenchController.watch)
+    monkeypatch.setattr("flasher.web.bench_watch.drive", _lost)
+    state = place.do(watch)
     assert isinstance(state.trouble, BusError)
     assert state.doing is Activity.NOTHING
 
@@ -627,14 +629,21 @@ def _lost(*_: object, **__: object) -> None:
     raise BusError("The adapter is gone.")
 
 
+def test_another_battery_than_the_one_shown_is_not_saved(place: BenchPlace) -> None:
+    place.do(order(BenchController.use_adapter, BikeFault.EXCHANGED.value))
+    for socket in place.bikes._bikes[BikeFault.EXCHANGED.value]._places:
+        socket._device = socket._made()
+    state = place.do(order(back_up, ""))
+    assert state.saved is None
+    assert isinstance(state.trouble, WrongDeviceError)
+
+
 @pytest.mark.slow
 def test_memory_and_answers_are_saved_to_a_file_as_by_the_command(place: BenchPlace) -> None:
-    state = place.do(
-        order(BenchController.use_adapter, BikeFault.NONE.value), BenchController.find_areas
-    )
+    state = place.do(order(BenchController.use_adapter, BikeFault.NONE.value), find_areas)
     assert state.areas is not None
     (area,) = state.areas  # new.bin has no addresses, and broken.hex is no image
-    saved = place.do(order(BenchController.back_up, area.source)).saved
+    saved = place.do(order(back_up, area.source)).saved
     assert saved is not None
     assert saved.path.parent.name == "backups"
     assert saved.path.name.startswith("bms-W2605001-")
@@ -651,11 +660,9 @@ def test_the_addresses_of_a_backup_may_be_those_of_an_image(
     image = IntelHex()
     image.frombytes(image_of(3, NEW).data, offset=0x0800_4000)
     image.write_hex_file(str(tmp_path / "running.hex"))
-    state = place.do(
-        order(BenchController.use_adapter, BikeFault.NONE.value), BenchController.find_areas
-    )
+    state = place.do(order(BenchController.use_adapter, BikeFault.NONE.value), find_areas)
     assert [each.start for each in state.areas or ()] == [AREA_START, 0x0800_4000]
-    state = place.do(order(BenchController.back_up, (state.areas or ())[1].source))
+    state = place.do(order(back_up, (state.areas or ())[1].source))
     assert state.saved is not None
     assert state.saved.area is not None
     assert state.saved.area.source.endswith("running.hex")
@@ -663,7 +670,7 @@ def test_the_addresses_of_a_backup_may_be_those_of_an_image(
 
 def test_a_backup_without_memory_says_what_is_not_in_it(place: BenchPlace) -> None:
     saved = place.do(
-        order(BenchController.use_adapter, BikeFault.NONE.value), order(BenchController.back_up, "")
+        order(BenchController.use_adapter, BikeFault.NONE.value), order(back_up, "")
     ).saved
     assert saved is not None
     assert (saved.area, saved.names_running_version) == (None, None)
@@ -673,16 +680,12 @@ def test_a_backup_without_memory_says_what_is_not_in_it(place: BenchPlace) -> No
 def test_nothing_is_saved_of_a_battery_that_is_silent_or_where_nothing_can_be_written(
     place: BenchPlace, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    state = place.do(
-        order(BenchController.use_adapter, BikeFault.OFF.value), order(BenchController.back_up, "")
-    )
+    state = place.do(order(BenchController.use_adapter, BikeFault.OFF.value), order(back_up, ""))
     assert isinstance(state.trouble, NoAnswerError)
     assert state.saved is None
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "file"))
-    state = place.do(
-        order(BenchController.use_adapter, BikeFault.NONE.value), order(BenchController.back_up, "")
-    )
+    state = place.do(order(BenchController.use_adapter, BikeFault.NONE.value), order(back_up, ""))
     assert isinstance(state.trouble, UsageError)
     assert state.saved is None
 

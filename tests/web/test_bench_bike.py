@@ -12,7 +12,8 @@ from flasher.api import DeviceInfo, Job
 from flasher.driver import Tap
 from flasher.errors import BusError, ErrorCode
 from flasher.protocol.spec import BMS, Target
-from flasher.web.bench import BenchController, UpgradeEnding
+from flasher.web.bench import BenchController
+from flasher.web.bench_backend import UpgradeEnding
 from flasher.web.bench_bike import upgrade_bike
 from flasher.web.bench_state import Activity, Adapter, BenchState
 from flasher.web.virtual_bike import BikeFault

@@ -19,7 +19,8 @@ from flasher.mock.profile import DeviceProfile
 from flasher.procedures import DeviceInfo
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WELLING, Target
-from flasher.web.bench import BenchController, UpgradeEnding
+from flasher.web.bench import BenchController
+from flasher.web.bench_backend import UpgradeEnding
 from flasher.web.bench_state import Activity, BenchState, Series, SeriesStep
 from flasher.web.series import SHOWN_S, take_next_bikes
 from flasher.web.virtual_bike import BikeFault, VirtualBike

@@ -40,10 +40,10 @@ from flasher.protocol.spec import BMS, Target
 from flasher.protocol.text import printable
 from flasher.settings.area import Area
 from flasher.settings.profile import Profile, load_profile
-from flasher.web import bench
 from flasher.web.archive import PAGES as KEPT
 from flasher.web.archive import Archive
 from flasher.web.bench import BenchController
+from flasher.web.bench_backend import UpgradeEnding
 from flasher.web.bench_compare import watch_compared
 from flasher.web.bench_page import BenchPage, Shelf, upload_limit
 from flasher.web.bench_state import Activity, Adapter, Saved
@@ -162,7 +162,7 @@ class _Place:
         keeps_settings: bool,
         on_event: Callable[[object], None],
         cancelled: Callable[[], bool],
-    ) -> bench.UpgradeEnding:
+    ) -> UpgradeEnding:
         output = self._output
 
         @contextmanager
@@ -186,7 +186,7 @@ class _Place:
         except FlasherError as error:
             upgrade_run.error = error
         bundle = None if upgrade_run.record is None else upgrade_run.record.bundle
-        return bench.UpgradeEnding(result, upgrade_run.error, bundle, upgrade_run.warning)
+        return UpgradeEnding(result, upgrade_run.error, bundle, upgrade_run.warning)
 
     def _listener(
         self, _adapter: Adapter, _job: Job, on_event: Callable[[object], None]
@@ -278,7 +278,7 @@ class VirtualBikes(_Place):
         keeps_settings: bool,
         on_event: Callable[[object], None],
         cancelled: Callable[[], bool],
-    ) -> bench.UpgradeEnding:
+    ) -> UpgradeEnding:
         """Limit the attempts, to show a bike's fault before the overall deadline."""
         limited = replace(job, options=replace(job.options, attempts=DEFAULT_ATTEMPTS))
         ending = super().upgrade(

@@ -1,0 +1,72 @@
+"""Back end of the bench: what it needs of real or virtual bikes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from flasher.api import Connection, Job, Result
+from flasher.errors import FlasherError
+from flasher.history import Flash
+from flasher.protocol.spec import Dialect, Target
+from flasher.settings.area import Area
+from flasher.settings.profile import Profile
+from flasher.web.bench_state import Adapter, Saved
+
+
+@dataclass
+class UpgradeEnding:
+    """End of an upgrade: result or error, bundle and entry in the history."""
+
+    result: Result | None
+    error: FlasherError | None
+    bundle: Path | None
+    warning: str = ""
+    """Reason why the history lacks the upgrade; "" if it has it."""
+
+
+class BenchBackend(Protocol):
+    """Access to the devices. Methods raise FlasherError."""
+
+    dialect: Dialect
+
+    def adapters(self, cancelled: Callable[[], bool]) -> Sequence[Adapter]: ...
+    def use(self, adapter: Adapter) -> None: ...
+    def profile(self, target: Target) -> Profile: ...
+    def bitrate_bps(self, adapter: Adapter) -> int: ...
+    def is_physical(self, adapter: Adapter) -> bool: ...
+    def images(self) -> Sequence[Path]: ...
+    def sets(self) -> Sequence[Path]: ...
+    def dropped(self) -> Sequence[str]: ...
+    def unfinished(self) -> Flash | None: ...
+    def use_folder(self, path: str) -> None: ...
+    def connect(self, adapter: Adapter, *, asks: bool = True) -> AbstractContextManager[Connection]:
+        """Open an adapter. With `asks` False, nothing may be sent."""
+
+    def model_area(self) -> Area | None:
+        """Memory area of a device model; None for real devices."""
+
+    def back_up(
+        self,
+        adapter: Adapter,
+        area: Area | None,
+        *,
+        on_event: Callable[[object], None],
+        cancelled: Callable[[], bool],
+    ) -> Saved:
+        """Save the battery's answers and the memory of an area to a new file."""
+
+    def upgrade(
+        self,
+        adapter: Adapter,
+        job: Job,
+        connect: Callable[[], AbstractContextManager[Connection]],
+        *,
+        keeps_settings: bool,
+        on_event: Callable[[object], None],
+        cancelled: Callable[[], bool],
+    ) -> UpgradeEnding:
+        """Run an upgrade to its end and store its records; `connect` opens the adapter."""
