@@ -189,7 +189,7 @@ def test_a_check_is_waived_in_a_second_step_that_names_the_risk(page: Page) -> N
     page.click("#target-bms:enabled")
     wrong = image_of(3, NEW).data[len(VECTORS) :]
     page.set_input_files("#file", {"name": "odd.bin", "mimeType": "", "buffer": wrong})
-    expect(page.locator("#refused-all")).to_contain_text("2 files")
+    expect(page.locator("#refused-all")).to_contain_text("fit: 2")
     page.click("#refused-all")
     page.click("#refused summary:text('Use it anyway')")
     # Its piece comes anew while it is read.
