@@ -6,6 +6,7 @@ screen.
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import tempfile
 import threading
@@ -258,7 +259,9 @@ def main() -> int:
     wrong: list[str] = []
     count = 0
     expect.set_options(timeout=60_000)  # many at once keep a computer busy
-    with chromium() as browser:
+    with tempfile.TemporaryDirectory() as own, chromium() as browser:
+        # Not the history, backups and bundles of this user.
+        os.environ |= {f"XDG_{each}_HOME": own for each in ("CONFIG", "DATA", "STATE")}
         for language in options.language or NAMES:
             album = album_of(browser, options.folder, language)
             wrong += album.wrong
