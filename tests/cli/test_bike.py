@@ -156,6 +156,7 @@ def test_a_device_that_reports_the_version_of_the_set_is_left_alone_unless_force
     assert bike.erased == [OBC, WMC], "these cannot report what they run"
     states = {each["target"]: each["state"] for each in again.document["devices"]}
     assert states == {"obc": "upgraded", "wmc": "upgraded", "bms": "up_to_date"}
+    assert "; BMS was up to date  " in upgrade().out
     bike.erased.clear()
     assert upgrade("--force").code == ExitCode.OK
     assert bike.erased == [OBC, WMC, BMS]

@@ -362,7 +362,7 @@ class BikeUpgrade:
 def _ending(name: str, result: Result) -> tuple[DeviceState, str]:
     """Return what became of a device, and what it runs as far as it reported that."""
     if result.outcome.nothing_to_do:
-        return DeviceState.UP_TO_DATE, f"{name} already runs {result.previous_version}"
+        return DeviceState.UP_TO_DATE, f"{name} was {_WORDS[DeviceState.UP_TO_DATE]}"
     if result.running_version is None:
         return DeviceState.UPGRADED, f"{name} confirmed its image (no version query)"
     return DeviceState.UPGRADED, f"{name} runs {result.running_version}"
