@@ -272,7 +272,7 @@ def test_image_info_tells_what_is_wrong_and_goes_on(
     flasher: Flasher, image: Path, manifest: Path
 ) -> None:
     run = flasher("image-info", image, "-t", "obc")
-    assert run.code == ExitCode.OK
+    assert run.code == ExitCode.WRONG_DEVICE
     assert "By its manifest the image is for the BMS, not the OBC." in run.out
     manifest.write_text("format = 7\n")
     run = flasher("image-info", image, "--json")
