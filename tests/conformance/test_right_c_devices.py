@@ -54,11 +54,20 @@ def test_a_seed_makes_the_same_device_again() -> None:
         (24, "BU-01"),  # a lost end of transfer was awaited for longer than its pause
         (2, "FR-09"),  # an empty frame splits a message
         (32, "CO-04"),  # a burst of one, and deaf before it
+        (54, "TX-12"),  # after a pause it takes its time to announce itself
         (33, "BU-01"),  # what came soon after half an end of transfer belonged to that
     ),
 )
 def test_a_freedom_of_the_document_passes(seed: int, case_id: str) -> None:
     assert faults_of(seed, Selection(cases=(case_id,)), make=right_c_device) == []
+
+
+def test_the_start_of_an_application_counts_from_the_end_of_the_window_in_walks() -> None:
+    device = right_c_device(56)
+    for profile in device.profiles.values():
+        with device.subject() as subject:
+            explorer = Explorer(subject, profile, seed="56")
+            assert explorer.replay(["reset", "cut=0", "reset"]).finding is None
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs a linker that wraps calls")

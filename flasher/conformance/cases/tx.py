@@ -452,7 +452,8 @@ def _announces_or_waits(bench: Bench) -> None:
     ended a transfer before a pause still does so.
     """
     image = transfer_image(bench)
-    pause_s = _LONG * bench.limit("pause_s")
+    # A device that restarts is not sent anything before it has announced itself.
+    pause_s = _LONG * bench.limit("pause_s") + bench.limit("first_version_s")
     bench.start_transfer(len(image))
     with bench.step("a short pause"):
         bench.wait(_SHORT * bench.limit("pause_s"))

@@ -191,7 +191,8 @@ class Walk:
             bench.forget()
         else:
             # A reset at the end of the window may have restarted the application meanwhile.
-            while (left_s := self._version_at + start_s - bench.now) > 0:
+            starts_s = bench.waits.burst_s + start_s
+            while (left_s := self._version_at + starts_s - bench.now) > 0:
                 self._listen(left_s)
         if self.phase is DevicePhase.ANNOUNCING:
             self.phase = DevicePhase.APPLICATION
