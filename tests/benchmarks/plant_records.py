@@ -67,6 +67,7 @@ def _catch_up(bench: Bench, url: str, runs: int) -> None:
     forwarder = Forwarder(
         bench.opened().database, bench.store.files, Central(url), "line-2", bench.clock
     )
+    Path("/proc/self/clear_refs").write_text("5", "ascii")  # the peak of recording counts no more
     with closing(forwarder):
         began_s, before_mb, at = time.perf_counter(), _peak_mb(), 0
         forwarder.forward()
