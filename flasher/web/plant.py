@@ -27,7 +27,7 @@ from flasher.plant.deliveries import DeliveryState
 from flasher.plant.delivery_list import Delivery, DeliveryFilter, deliveries_of, receivers_of
 from flasher.station.records.overview import PAGE_SIZE, Page
 from flasher.web.query_processes import Answer, Question
-from flasher.web.supervisor import PAGES, SupervisorPages, cursor_of, moment_in
+from flasher.web.supervisor import PAGES, SupervisorPages, cursor_of, id_in, moment_in
 
 STATIONS: Final = "/stations"
 """Path of the page of all stations."""
@@ -123,7 +123,7 @@ class PlantPages(SupervisorPages):
 def _chosen(question: Question) -> DeliveryFilter:
     """Parse the filter of a form. Raises UsageError for an invalid time or state."""
     fields = question.fields
-    state, run_id = fields.get("state"), fields.get("run", "")
+    state = fields.get("state")
     if state is not None and state not in set(DeliveryState):
         raise UsageError("There is no such state.", remedy="Choose one of the form.")
     return DeliveryFilter(
@@ -132,7 +132,7 @@ def _chosen(question: Question) -> DeliveryFilter:
         station=fields.get("station"),
         serial=fields.get("serial"),
         key=fields.get("key"),
-        run_id=int(run_id) if run_id.isascii() and run_id.isdigit() and len(run_id) < 19 else None,
+        run_id=id_in(question, "run"),
         since=moment_in(question, "from"),
         until=moment_in(question, "to"),
     )

@@ -614,12 +614,13 @@ def _part(
 
 def cursor_of(question: Question) -> PageCursor:
     """Parse the page of a list."""
+    return PageCursor(id_in(question, "before"), id_in(question, "after"))
 
-    def at(name: str) -> int | None:
-        text = question.fields.get(name, "")
-        return int(text) if text.isascii() and text.isdigit() and len(text) < 19 else None
 
-    return PageCursor(at("before"), at("after"))
+def id_in(question: Question, name: str) -> int | None:
+    """Parse the id of a row. None if it is none."""
+    text = question.fields.get(name, "")
+    return int(text) if text.isascii() and text.isdigit() and len(text) < 19 else None
 
 
 class _Addresses:
