@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,7 +16,10 @@ from flasher.plant.forwarder import Forwarder
 from flasher.plant.setup import DELIVERERS, READERS, role_of, setup
 from flasher.plant.stations import StationStatus, stations_of
 from flasher.plant.store import PlantStore
+from flasher.station.records.keys import KeyLocations
 from flasher.station.records.store import Store
+from flasher.web.plant import PlantPages
+from flasher.web.supervisor import SupervisorPages, open_supervisor
 from tests.station.factory import Bench, FakeClock
 from tests.station.postgres import OWNER, Server
 
@@ -85,6 +89,14 @@ class Plant:
         """The runs as reports and pages read them."""
         url = self.url(READER)
         return PlantStore.open(url, station="desk", folder=self.folder / "desk", read_only=True)
+
+    @contextmanager
+    def pages(self) -> Iterator[SupervisorPages]:
+        """The pages of all stations."""
+        folder, keys = self.folder / "desk", KeyLocations(self.folder / "desk-keys")
+        made = open_supervisor(self.url(READER), folder, keys, (), PlantStore, PlantPages)
+        with closing(made.store):
+            yield made
 
 
 @dataclass

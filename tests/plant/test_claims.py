@@ -25,7 +25,6 @@ from flasher.plant.claim_list import (
 from flasher.plant.claims import LEASE_S, PlantClaims, _Own
 from flasher.plant.deliveries import document_of
 from flasher.plant.setup import role_of, setup
-from flasher.plant.store import PlantStore
 from flasher.station.gate import Gate
 from flasher.station.records.errors import ClaimRefusedError, Refusal
 from flasher.station.records.model import (
@@ -36,9 +35,7 @@ from flasher.station.records.model import (
     RunId,
     RunState,
 )
-from flasher.web.plant import PlantPages
 from flasher.web.query_processes import Question
-from flasher.web.supervisor import open_supervisor
 from tests.plant.claims_world import Centre, Claimed, Station, World, _Claims
 from tests.plant.factory import COURIER, READER, Plant, Sender
 from tests.station.factory import HEAD, SERIAL, SERIAL_NUMBER, USUAL
@@ -505,11 +502,7 @@ def test_a_run_that_arrives_after_its_claim_was_released_is_marked(
     assert (first.duplicates, runs["line-3"].duplicates) == (CHECKED, CHECKED)
     assert runs["line-2"].duplicates == twice.second.duplicates == RELEASED_MARK
     assert twice.first.duplicates == CHECKED
-    pages = open_supervisor(
-        plant.url(READER), plant.folder / "desk", gone.bench.key_locations, (), PlantStore,
-        PlantPages,
-    )  # fmt: skip
-    with closing(pages.store):
+    with plant.pages() as pages:
         shown = pages.answer(Question("/runs")).body.decode()
         assert shown.count("<small>duplicates not checked</small>") == 2, "in both tables"
         unit = pages.answer(Question("/units", {"serial": SERIAL, "part": "BAT-36"})).body.decode()

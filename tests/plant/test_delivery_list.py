@@ -14,11 +14,9 @@ from flasher.plant.central import Central
 from flasher.plant.deliveries import Answer, Deliveries, DeliveryState, parse_key
 from flasher.plant.delivery_list import DeliveryFilter, deliveries_of, receivers_of
 from flasher.plant.setup import setup
-from flasher.plant.store import PlantStore
 from flasher.station.records.newest import PageCursor
-from flasher.web.plant import PlantPages
 from flasher.web.query_processes import Question
-from flasher.web.supervisor import open_supervisor
+from flasher.web.supervisor import SupervisorPages
 from tests.plant.factory import COURIER, READER, Plant, Sender
 
 SERIALS = ["W2605002", "W2605003", "W2605004"]
@@ -134,24 +132,21 @@ def test_runs_of_a_station_with_new_records_are_listed(desk: Desk) -> None:
 
 
 @pytest.fixture
-def pages(desk: Desk, sender: Sender) -> Iterator[PlantPages]:
-    made = open_supervisor(
-        desk.plant.url(READER), desk.plant.folder / "desk", sender.bench.key_locations, (),
-        PlantStore, PlantPages,
-    )  # fmt: skip
-    with closing(made.store):
-        assert isinstance(made, PlantPages)
+def pages(desk: Desk) -> Iterator[SupervisorPages]:
+    with desk.plant.pages() as made:
         yield made
 
 
-def page(pages: PlantPages, path: str = "/deliveries", language: str = "en", **fields: str) -> str:
+def page(
+    pages: SupervisorPages, path: str = "/deliveries", language: str = "en", **fields: str
+) -> str:
     answer = pages.answer(Question(path, fields, language=language))
     assert answer.status == 200, answer.body.decode()
     return answer.body.decode()
 
 
 def test_the_page_shows_what_was_refused_why_and_how_to_send_it_again(
-    desk: Desk, pages: PlantPages
+    desk: Desk, pages: SupervisorPages
 ) -> None:
     key = desk.end("W2605002", DeliveryState.REFUSED, REASON)
     whole = page(pages)
@@ -178,7 +173,7 @@ def test_the_page_shows_what_was_refused_why_and_how_to_send_it_again(
         page(pages, language=language, state="refused")
 
 
-def test_a_unit_and_a_run_lead_to_their_deliveries(pages: PlantPages) -> None:
+def test_a_unit_and_a_run_lead_to_their_deliveries(pages: SupervisorPages) -> None:
     unit = page(pages, "/units", serial="W2605003", part="BAT-36")
     assert '<a href="/deliveries?serial=W2605003">its deliveries</a>' in unit
     (link,) = [line for line in unit.splitlines() if "deliveries of this run" in line]
@@ -194,19 +189,14 @@ def test_a_unit_and_a_run_lead_to_their_deliveries(pages: PlantPages) -> None:
     [{"state": "lost"}, {"from": "soon"}, {"key": "W2605002"}],
     ids=lambda each: next(iter(each)),
 )
-def test_a_wrong_field_is_explained(pages: PlantPages, fields: dict[str, str]) -> None:
+def test_a_wrong_field_is_explained(pages: SupervisorPages, fields: dict[str, str]) -> None:
     assert pages.answer(Question("/deliveries", fields)).status == 400
 
 
-def test_without_a_receiver_there_is_nothing_to_filter(plant: Plant, sender: Sender) -> None:
+def test_without_a_receiver_there_is_nothing_to_filter(plant: Plant) -> None:
     with plant.connect() as owner:  # as `init` leaves it without the extra `handover`
         owner.execute("DROP TABLE procrastinate_jobs CASCADE")
-    pages = open_supervisor(
-        plant.url(READER), plant.folder / "desk", sender.bench.key_locations, (), PlantStore,
-        PlantPages,
-    )  # fmt: skip
-    with closing(pages.store):
-        assert isinstance(pages, PlantPages)
+    with plant.pages() as pages:
         shown = page(pages, serial="W2605002")
     assert "There is no receiver" in shown
     assert "<form" not in shown

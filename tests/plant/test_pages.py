@@ -10,9 +10,8 @@ from flasher.plant.store import PlantStore
 from flasher.station.records.capability import Capability
 from flasher.station.records.model import Admission, Order, RunFilter
 from flasher.station.records.rollup import Rollup
-from flasher.web.plant import PlantPages
 from flasher.web.query_processes import Question
-from flasher.web.supervisor import SupervisorPages, open_supervisor
+from flasher.web.supervisor import SupervisorPages
 from tests.plant.factory import READER, Plant, Sender
 from tests.station.factory import SERIAL
 from tests.station.records.test_capability import VALUES, measure
@@ -76,10 +75,7 @@ def test_units_that_passed_at_two_stations_are_shown_with_their_marks(
         lines = list(passed_twice_lines([found]))
         assert lines[0] == "passed at two stations: 1 unit"
         assert lines[1].endswith("duplicates NOT CHECKED")
-    pages = open_supervisor(
-        plant.url(READER), plant.folder / "desk", sender.bench.key_locations, (), PlantStore
-    )
-    with closing(pages.store):
+    with plant.pages() as pages:
         runs = page(pages, "/runs")
         assert "passed at two stations" in runs
         assert runs.count("<small>duplicates not checked</small>") == 2  # table and list
@@ -94,10 +90,7 @@ def test_each_page_shows_the_units_of_all_stations(plant: Plant, sender: Sender)
     for each in (sender, other):
         each.send()
     other.close()
-    pages = open_supervisor(
-        plant.url(READER), plant.folder / "desk", sender.bench.key_locations, (), PlantStore
-    )
-    with closing(pages.store):
+    with plant.pages() as pages:
         runs = page(pages, "/runs")
         assert "W2605002" in runs
         assert "W2605003" in runs
@@ -117,11 +110,7 @@ def test_the_page_of_stations_leads_to_the_runs_of_one(plant: Plant, sender: Sen
     for each in (sender, other):
         each.send()
     other.close()
-    pages = open_supervisor(
-        plant.url(READER), plant.folder / "desk", sender.bench.key_locations, (), PlantStore,
-        PlantPages,
-    )  # fmt: skip
-    with closing(pages.store):
+    with plant.pages() as pages:
         shown = page(pages, "/stations")
         assert '<a href="/runs?station=line-3">line-3</a>' in shown
         assert "There is no alert." in shown
@@ -151,10 +140,7 @@ def test_capability_is_computed_as_at_the_station(plant: Plant, sender: Sender) 
     own = sender.bench.store.read.capabilities()
     with closing(opened(plant)) as store:
         assert [*map(_rounded, store.read.capabilities())] == [*map(_rounded, own)]
-    pages = open_supervisor(
-        plant.url(READER), plant.folder / "desk", sender.bench.key_locations, (), PlantStore
-    )
-    with closing(pages.store):
+    with plant.pages() as pages:
         shown = page(pages, "/measurements")
         assert f"{own[0].ppk:.2f}" in shown
         assert "from 7 to 14 V" in shown
