@@ -6,13 +6,14 @@ import logging
 import multiprocessing
 import os
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext
 from pathlib import Path
-from typing import Final
+from typing import Final, NoReturn
 
 from flasher.errors import FlasherError
 from flasher.plant.central import Central
@@ -127,7 +128,7 @@ def _send_in_process(context: SpawnContext, what: Sending, over: threading.Event
         process.join()
 
 
-def _work(channel: Connection, what: Sending) -> None:
+def _work(channel: Connection, what: Sending) -> NoReturn:
     with suppress(OSError, AttributeError):
         os.nice(10)  # units come first
 
@@ -135,10 +136,8 @@ def _work(channel: Connection, what: Sending) -> None:
         """True as soon as the station has ended; a killed one closes the channel too."""
         return channel.poll(limit_s)
 
-    has_ended = threading.Event()
-    fetching = threading.Thread(target=_fetch, args=(what, has_ended), daemon=True)
     if what.recipes_for:
-        fetching.start()
+        threading.Thread(target=_fetch, args=(what,), daemon=True).start()
     is_over = False
     while not is_over:
         try:
@@ -148,19 +147,19 @@ def _work(channel: Connection, what: Sending) -> None:
         except FlasherError as error:
             _LOG.warning("nothing is sent to the plant: %s", error)
             is_over = wait(RETRY_MAX_S)
-    has_ended.set()
+    # Everything is saved and closed. The interpreter's clean-up takes seconds on a busy computer,
+    # and the station waits for the end of this process.
+    os._exit(0)
 
 
-def _fetch(what: Sending, over: threading.Event) -> None:
-    """Fetch recipes until `over`. The end of the process may cut it off: a recipe is added as a
-    whole.
-    """
-    while not over.is_set():
+def _fetch(what: Sending) -> None:
+    """Fetch recipes. The end of the process may cut it off: a recipe is added as a whole."""
+    while True:
         try:
             with closing(what.open_fetcher()) as fetcher:
-                while not over.is_set():
+                while True:
                     fetcher.fetch()
-                    over.wait(FETCH_S)
+                    time.sleep(FETCH_S)
         except FlasherError as error:
             _LOG.warning("no recipe is fetched from the plant: %s", error)
-            over.wait(FETCH_S)
+            time.sleep(FETCH_S)

@@ -7,6 +7,7 @@ import io
 import json
 import multiprocessing
 import sqlite3
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -306,6 +307,17 @@ def test_a_station_without_the_server_passes_its_units(
 def test_the_process_ends_with_a_station_that_had_no_records(tmp_path: Path) -> None:
     with sending(Sending("postgresql://x@127.0.0.1:1/p", "line-2", str(tmp_path / "no"), None)):
         pass
+
+
+def test_the_process_leaves_without_a_clean_up_as_the_station_waits_for_it(tmp_path: Path) -> None:
+    program = (
+        "import atexit, multiprocessing, sys; from flasher.plant.process import Sending, _work;"
+        "atexit.register(print, 'cleaned up'); ours, theirs = multiprocessing.Pipe(); ours.close();"
+        "_work(theirs, Sending('postgresql://x@127.0.0.1:1/p', 'line-2', sys.argv[1], None))"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path / "no")]
+    ended = subprocess.run(command, check=True, capture_output=True, text=True)
+    assert ended.stdout == ""
 
 
 def test_what_reads_all_stations(flasher: Flasher, plant: Plant, sender: Sender) -> None:
