@@ -154,20 +154,9 @@ class Outcome:
             explained = _NO_SESSION_EITHER
         elif self.ending is Ending.TWO_DEVICES and self.device_left.needs_rescue:
             explained = _TWO_PERHAPS_ERASED
-        kind, cause, remedy, code = explained
-        node, ending = self.target.node.name, text(wording(self.ending))
-        what = text("{node}: {ending}.", node=node, ending=ending)
-        if self.detail:
-            detail = self.detail
-            what = text("{node}: {ending} ({detail}).", node=node, ending=ending, detail=detail)
-        names = {"node": node, "boot_name": self.target.boot_name, "again": text(AGAIN)}
-        error = kind(
-            what,
-            where=self.where,
-            cause=Text(cause, names),
-            remedy=with_device_state(Text(remedy, names), self.device_left),
-            code=code,
-        )
+        error = explained.error(self.ending, self.target, self.detail)
+        error.where = self.where
+        error.remedy = with_device_state(error.remedy, self.device_left)
         error.needs_rescue = self.device_left.needs_rescue
         error.waiver = self.waiver or _WAIVERS.get(self.ending, "")
         return error
@@ -212,6 +201,16 @@ class _Explanation(NamedTuple):
     remedy: str
     code: ErrorCode | None = None
     """None for the code of the class."""
+
+    def error(self, ending: Ending, target: Target, detail: str) -> FlasherError:
+        """Create the error, without what it says of the device."""
+        node, shown = target.node.name, text(wording(ending))
+        what = text("{node}: {ending}.", node=node, ending=shown)
+        if detail:
+            what = text("{node}: {ending} ({detail}).", node=node, ending=shown, detail=detail)
+        names = {"node": node, "boot_name": target.boot_name, "again": text(AGAIN)}
+        cause, remedy = Text(self.cause, names), Text(self.remedy, names)
+        return self.kind(what, cause=cause, remedy=remedy, code=self.code)
 
 
 AGAIN: Final = "Run the same command again."
@@ -368,6 +367,11 @@ _NO_SESSION_EITHER: Final = _EXPLANATIONS[Ending.NO_BOOT_VERSION]._replace(
 _TWO_PERHAPS_ERASED: Final = _Explanation(
     WrongDeviceError, TWO_DEVICES_CAUSE, TWO_DEVICES_REMEDY, code=ErrorCode.TWO_DEVICES
 )
+
+
+def image_refused(ending: Ending, target: Target, detail: str) -> FlasherError:
+    """Create the error for an image that a check refuses where no device is concerned."""
+    return _EXPLANATIONS[ending].error(ending, target, detail)
 
 
 def _late(phase: Phase, left: DeviceLeft) -> _Explanation:

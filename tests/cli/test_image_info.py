@@ -210,3 +210,17 @@ def test_an_image_that_names_another_target_is_refused_as_flash_refuses_it(
     ).code  # fmt: skip
     assert "the image names the WMC inside, not the BMS" in run.err
     assert "names:   WMC" in run.out
+    assert "device: " not in run.err, "no device was concerned"
+    assert "--allow" not in run.err, "it has no such option"
+
+
+def test_an_image_that_is_not_plausible_is_refused_with_the_option_that_shows_it(
+    flasher: Flasher, tmp_path: Path
+) -> None:
+    file = tmp_path / "tiny.bin"
+    file.write_bytes(bytes(range(200, 240)))
+    run = flasher("image-info", file, "--base", "0x8008000")
+    assert run.code == ExitCode.IMAGE
+    assert "device: " not in run.err
+    assert "--allow-implausible waives this" in run.err
+    assert flasher("image-info", file, "--base", "0x8008000", "--allow-implausible").code == 0

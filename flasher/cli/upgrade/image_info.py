@@ -28,6 +28,7 @@ from flasher.cli.upgrade import text
 from flasher.cli.upgrade.manifest import ManifestBesideDocument, beside_line, manifest_beside
 from flasher.errors import ExitCode, FlasherError, ImageError, UsageError
 from flasher.host.identity import IdentityCheck, judge_bytes, judge_image
+from flasher.host.outcome import image_refused
 from flasher.image.cortexm import vector_table
 from flasher.protocol.spec import BMS, Target
 from flasher.protocol.text import printable
@@ -183,9 +184,10 @@ def _show(
         judge_bytes(loaded, identity) if target is None else judge_image(loaded, target, identity)
     )
     for found in judged:
-        error = api.refusal(plan, found)
-        if error is not None:
-            return document, error
+        if found.ending is not None:
+            has_option = found.check is IdentityCheck.PLAUSIBLE  # of all that waive a check
+            detail = found.detail if has_option else found.text
+            return document, image_refused(found.ending, plan.target, detail)
         output.result(text.check_line(found.event))
     return document, None
 
