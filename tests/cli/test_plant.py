@@ -628,10 +628,12 @@ def test_expired_claims_are_released_for_a_reason(
     sender.send()
     claim = (
         "INSERT INTO plant_claim (token, station, part, serial, socket, claimed_at, expires_at)"
-        " SELECT '{0}', station, 'BAT-36', '{0}', 'A', now(), now() + interval '{1}'"
+        " SELECT '{0}', station, 'BAT-36', '{0}', 'A', '2026-05-17 12:00Z',"
+        " now() + interval '{1}'"
         " FROM plant_station WHERE name = 'line-2'"
     )
     with plant.connect() as owner:
+        owner.execute(f"ALTER DATABASE {plant.database} SET timezone = 'Asia/Shanghai'".encode())
         for serial, left in (("W2605011", "-1 min"), ("W2605012", "1 min")):
             owner.execute(claim.format(serial, left).encode())
     words = ("plant", "claims", "--database", plant.url())
@@ -651,7 +653,8 @@ def test_expired_claims_are_released_for_a_reason(
     (left,), (old,) = run.document["claims"], run.document["released"]
     assert (left["serial"], old["serial"]) == ("W2605012", "W2605011")
     lines = flasher(*words).out.splitlines()
-    assert lines[0].startswith("BAT-36 W2605012, line-2, socket A, claimed")
+    begin = "BAT-36 W2605012, line-2, socket A, claimed 2026-05-17 12:00:00 UTC: valid until "
+    assert lines[0].startswith(begin)
     assert lines[1].endswith(" by postgres: its disk\\tbroke")
     again = flasher(*words, "--serial", "W2605012", "--release", "--reason", "impatient")
     assert again.code == ExitCode.USAGE

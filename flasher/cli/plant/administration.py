@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sqlalchemy import make_url
 
-from flasher.cli.output import Output, byte_count, counted, duration
+from flasher.cli.output import Output, byte_count, counted, duration, utc_time
 from flasher.cli.plant.commands import BoundsOptions
 from flasher.cli.plant.documents import (
     PlantFetchDocument,
@@ -154,14 +154,15 @@ def _lines(of: StationOverview) -> Iterator[str]:
     if each.refusal:
         yield printable(f"  REFUSED: {each.refusal}")
     if each.other_reported_at is not None:
-        at = f"{each.other_reported_at:%Y-%m-%d %H:%M:%S %Z}"
+        at = utc_time(each.other_reported_at)
         yield printable(f"  another PC, REFUSED at {at}: {each.other_refusal}")
     at = f", of {printable(each.head_at)}" if each.head_at else ""
     yield f"  last row:  {each.head_number:,}{at}, hash {(each.head_hash or 'none')[:16]}"
     if (last := of.activity.last_run) is not None:
         code = "" if last.state is RunState.PASS else f" {last.code}"
-        begun = f"{last.begun_at:%Y-%m-%d %H:%M:%S} UTC"
-        yield printable(f"  last run:  {last.serial}, {begun}, {last.state.value}{code}")
+        yield printable(
+            f"  last run:  {last.serial}, {utc_time(last.begun_at)}, {last.state.value}{code}"
+        )
     yield f"  yield:     shift {_yield_text(of.activity.shift)}, day {_yield_text(of.activity.day)}"
     if each.unsent:
         oldest = printable(each.oldest_unsent_at or "")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from flasher.cli.output import Output, counted
+from flasher.cli.output import Output, counted, utc_time
 from flasher.cli.plant.commands import ClaimOptions
 from flasher.cli.plant.documents import PlantClaimsDocument
 from flasher.errors import UsageError
@@ -51,11 +51,11 @@ def claims(
 def _lines(found: list[UnitClaim], released: list[ReleasedClaim]) -> Iterator[str]:
     for each in found:
         state = "EXPIRED" if each.is_expired else "valid until"
-        yield f"{_what(each)}: {state} {each.expires_at:%Y-%m-%d %H:%M:%S}"
+        yield f"{_what(each)}: {state} {utc_time(each.expires_at)}"
     if not found:
         yield "no claims"
     for old in released:
-        when = f"{old.released_at:%Y-%m-%d %H:%M:%S}"
+        when = utc_time(old.released_at)
         yield f"{_what(old)}: released {when} by {old.released_by}: {old.reason}"
         if old.run_id is not None:
             outcome = old.outcome or "retired"
@@ -65,4 +65,4 @@ def _lines(found: list[UnitClaim], released: list[ReleasedClaim]) -> Iterator[st
 
 def _what(claim: UnitClaim | ReleasedClaim) -> str:
     where = f"{claim.station or _NO_STATION}, socket {claim.socket}"
-    return f"{claim.part} {claim.serial}, {where}, claimed {claim.claimed_at:%Y-%m-%d %H:%M:%S}"
+    return f"{claim.part} {claim.serial}, {where}, claimed {utc_time(claim.claimed_at)}"

@@ -10,7 +10,7 @@ from typing import Final
 
 from flasher.cli.documents import SCHEMA_VERSION
 from flasher.cli.extras import need
-from flasher.cli.output import Output, counted
+from flasher.cli.output import Output, counted, utc_time
 from flasher.cli.plant.commands import DeliveryOptions
 from flasher.cli.plant.documents import PlantDeliverDocument, PlantDeliveriesDocument
 from flasher.cli.station.records import moment_of
@@ -117,11 +117,10 @@ def deliveries(
 def _receiver_lines(receivers: list[ReceiverStatus]) -> Iterator[str]:
     for each in receivers:
         counts = ", ".join(f"{count:,} {state}" for state, count in sorted(each.counts.items()))
-        since = f"since {each.since:%Y-%m-%d %H:%M}"
-        stopped = "" if each.stopped_at is None else f", STOPPED {each.stopped_at:%Y-%m-%d %H:%M}"
-        yield f"{each.name}: {counts or 'no runs'}, {since}{stopped}"
+        stopped = "" if each.stopped_at is None else f", STOPPED {utc_time(each.stopped_at)}"
+        yield f"{each.name}: {counts or 'no runs'}, since {utc_time(each.since)}{stopped}"
         if each.oldest_open_at is not None:
-            yield f"  the oldest open one arrived {each.oldest_open_at:%Y-%m-%d %H:%M:%S}"
+            yield f"  the oldest open one arrived {utc_time(each.oldest_open_at)}"
     if not receivers:
         yield "no receivers: flasher plant deliver --receivers FILE --database URL adds them"
 
@@ -131,7 +130,7 @@ def _lines(row: Delivery) -> Iterator[str]:
     yield f"{row.serial}, {row.outcome}{nature}, {row.station}: {row.state} to {row.receiver}"
     yield f"  key {row.key}"
     tried = counted(row.attempts, "attempt")
-    later = "" if row.next_at is None else f", next at {row.next_at:%H:%M:%S}"
+    later = "" if row.next_at is None else f", next at {utc_time(row.next_at)}"
     yield f"  {tried}{later}{': ' if row.answer else ''}{row.answer}"
 
 

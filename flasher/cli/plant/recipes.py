@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 
-from flasher.cli.output import Output
+from flasher.cli.output import Output, utc_time
 from flasher.cli.plant.documents import PlantPublishDocument, PlantRecipesDocument
 from flasher.plant import recipes as centre
 from flasher.plant.central import open_central
@@ -65,6 +65,6 @@ def _lines(events: Sequence[RecipeEvent]) -> Iterator[str]:
         where = f"{each.station or 'all stations'}, {each.socket or 'all sockets'}"
         detail = each.reason if each.what == WITHDRAWN else where
         yield printable(
-            f"{each.at.astimezone(UTC):%Y-%m-%d %H:%M} UTC {each.what} by {each.by}: {each.name},"
+            f"{utc_time(each.at)} {each.what} by {each.by}: {each.name},"
             f" revision {each.revision}, {each.digest[:16]}: {detail}"
         )

@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.look.explain_text import story_lines
-from flasher.cli.output import Output, counted, duration
+from flasher.cli.output import Output, counted, duration, utc_time
 from flasher.cli.station.commands import RecordsOptions, ReportOptions
 from flasher.cli.station.documents import (
     StationReportDocument,
@@ -286,9 +286,8 @@ def _run_lines(details: RunDetails) -> Iterator[str]:
     run = details.run
     took = "" if run.duration_s is None else f" after {duration(run.duration_s)}"
     code = "" if run.state is RunState.PASS else f" {run.code}"
-    begun = f"{run.begun_at:%Y-%m-%d %H:%M:%S} UTC"
     kind = f"virtual {run.kind.value}" if run.is_virtual else run.kind.value
-    yield f"run {run.run_id}, {begun}, {kind}: {run.state.value}{code}{took}"
+    yield f"run {run.run_id}, {utc_time(run.begun_at)}, {kind}: {run.state.value}{code}{took}"
     if run.text:
         yield f"  {printable(run.text)}"
     if run.reason:
