@@ -19,6 +19,8 @@ from flasher.plant.functions import DEFINER, REFUSED
 from flasher.station.records.model import PLANT_CLAIM, RunKind, StepName
 from flasher.station.records.server import ServerLock
 
+NO_STATION: Final = "a station whose records were replaced"
+"""In the place of the name of a station."""
 _OPEN_MAX: Final = 1000
 """Claims of a station that have not expired; with 64 sockets it has a fraction of that."""
 _LEASE_MAX_S: Final = 600
@@ -80,7 +82,7 @@ BEGIN
         socket := other.socket;
         at := other.claimed_at;
         station := coalesce((SELECT p.name FROM plant_station p WHERE p.station = other.station),
-            'a station whose records were replaced');
+            '{NO_STATION}');
     END IF;
     IF state IS DISTINCT FROM 'running' THEN
         IF (SELECT count(*) FROM plant_claim c WHERE c.station = mine.station

@@ -9,6 +9,7 @@ from flasher.cli.plant.commands import ClaimOptions
 from flasher.cli.plant.documents import PlantClaimsDocument
 from flasher.errors import UsageError
 from flasher.plant.central import open_central
+from flasher.plant.claim_functions import NO_STATION
 from flasher.plant.claim_list import (
     ClaimFilter,
     ReleasedClaim,
@@ -19,8 +20,6 @@ from flasher.plant.claim_list import (
 )
 from flasher.protocol.text import printable
 from flasher.station.records.model import RunState
-
-_NO_STATION = "a station whose records were replaced"
 
 
 def claims(
@@ -64,5 +63,5 @@ def _lines(found: list[UnitClaim], released: list[ReleasedClaim]) -> Iterator[st
 
 
 def _what(claim: UnitClaim | ReleasedClaim) -> str:
-    where = f"{claim.station or _NO_STATION}, socket {claim.socket}"
+    where = f"{claim.station or NO_STATION}, socket {claim.socket}"
     return f"{claim.part} {claim.serial}, {where}, claimed {utc_time(claim.claimed_at)}"
