@@ -38,7 +38,7 @@ _BEGAN: Final = "began"
 _ENDED: Final = "ended"
 _REACHED_SIZE: Final = 32
 """Size of a progress file in bytes, written with one call."""
-MOCK: Final = "the built-in mock"
+MOCK: Final = text("the built-in mock")
 """Adapter name of a device model, which ends with its program."""
 _LEFT_IN: Final = {
     Phase.UPDATE.value: "perhaps_erased",

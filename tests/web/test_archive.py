@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import io
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from flasher.history import FlashHistory, Reached
+from flasher.history import MOCK, FlashHistory, Reached
 from flasher.trace.bundle import write_bundle
 from flasher.trace.taps import FlightRecorder
 from flasher.web.archive import Archive
@@ -94,3 +95,12 @@ def test_an_upgrade_without_an_end_names_what_it_left(kept: Archive) -> None:
     page = _asked(kept, "/kept").body.decode()
     assert "the program was killed" in page
     assert "its application is erased" in page
+
+
+def test_the_built_in_mock_is_named_in_the_language_of_the_page(kept: Archive) -> None:
+    history = FlashHistory()
+    history.begin(replace(BEGAN, adapter=MOCK))
+    (flash,) = history.flashes()[0]
+    assert flash.began.adapter == MOCK
+    page = kept.answer(Question("/kept", language="de")).body.decode()
+    assert "<dd>das eingebaute Gerätemodell</dd>" in page
