@@ -26,6 +26,13 @@ PAGES = (
     "/certificate",
 )  # fmt: skip
 _SCREENS: tuple[tuple[int, Any], ...] = ((390, "dark"), (1280, "light"))
+_BROKEN = """(which) => [...document.querySelectorAll(which)].filter((each) => {
+  const range = document.createRange();
+  range.selectNodeContents(each);
+  const lines = new Set([...range.getClientRects()].map((rect) => Math.round(rect.top)));
+  return !/\\s/.test(each.textContent.trim()) && lines.size > 1;
+}).map((each) => each.textContent)"""
+"""Words that are on more than one line."""
 
 
 @pytest.fixture(scope="module")
@@ -152,13 +159,14 @@ def test_no_word_of_a_measurement_breaks_on_a_phone(tab: Tab, url: str, language
     page = tab.page
     page.set_viewport_size({"width": 390, "height": 844})
     page.goto(f"{url}units?serial=W2605009&lang={language}")
-    broken = page.evaluate(
-        """() => [...document.querySelectorAll("tr.measured td")].filter((cell) => {
-          const range = document.createRange();
-          range.selectNodeContents(cell);
-          const lines = new Set([...range.getClientRects()].map((each) => Math.round(each.top)));
-          return !/\\s/.test(cell.textContent.trim()) && lines.size > 1;
-        }).map((cell) => cell.textContent)"""
-    )
     assert page.locator("tr.measured").count()
-    assert broken == []
+    assert page.evaluate(_BROKEN, "tr.measured td") == []
+
+
+@each("language", NAMES)
+def test_no_word_of_a_link_beside_a_button_breaks(tab: Tab, url: str, language: str) -> None:
+    page = tab.page
+    page.set_viewport_size({"width": 1280, "height": 844})
+    page.goto(f"{url}audit?lang={language}")
+    assert page.locator(".buttons a").count()
+    assert page.evaluate(_BROKEN, ".buttons a") == []
