@@ -143,7 +143,7 @@ def worker_setups(
 def with_recipe(setup: WorkerSetup, recipe: LoadedRecipe) -> WorkerSetup:
     """Settings of the same socket with another recipe."""
     files = {str(path): sha256 for path, sha256 in recipe.files.items()}
-    return replace(setup, recipe=recipe.path, files=files, may_waive=not recipe.digest)
+    return replace(setup, recipe=recipe.path, files=files, is_from_plant=bool(recipe.digest))
 
 
 # -- detection ------------------------------------------------------------------------------------

@@ -27,7 +27,7 @@ from flasher.errors import ErrorCode, FlasherError, UsageError
 from flasher.files import is_plain, read
 from flasher.i18n import text
 from flasher.protocol.text import printable
-from flasher.station.recipe_file import LoadedRecipe, load_checked, sha256_of
+from flasher.station.recipe_file import DAMAGED_COPY, LoadedRecipe, load_checked, sha256_of
 from flasher.station.records.chain import canonical
 from flasher.station.records.database import in_file_name
 from flasher.station.records.errors import RecordError, mapped
@@ -42,10 +42,6 @@ _PART: Final = ".part-"
 _STATE_MAX_SIZE: Final = 256 * 1024
 _PART_AGE_S: Final = 3600.0
 _NOT_KEPT: Final = "A recipe from the plant cannot be saved"
-_DAMAGED: Final = text(
-    "The copy of a recipe from the plant is damaged. It is fetched again when the server can be"
-    " reached."
-)
 
 
 @dataclass(frozen=True)
@@ -251,7 +247,7 @@ def _write(path: Path, pieces: Iterable[bytes]) -> str:
 
 def _damaged(path: Path) -> UsageError:
     return UsageError(
-        _DAMAGED,
+        DAMAGED_COPY,
         where=printable(str(path)),
         remedy=text("Approve another recipe, or wait until it was fetched again."),
         code=ErrorCode.FILE_NOT_READ,

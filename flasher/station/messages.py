@@ -105,8 +105,9 @@ class WorkerSetup:
     """Arguments of python-can's bus; None: virtual units."""
     virtual: VirtualUnits | None = None
     power: str = ""
-    may_waive: bool = True
-    """The recipe may waive signatures; those from the plant may not."""
+    is_from_plant: bool = False
+    """The recipe is a copy of the plant's: it may waive no signature, and a damaged one is fetched
+    again."""
 
 
 # -- from the station -----------------------------------------------------------------------------
@@ -151,7 +152,9 @@ class Beat:
 
 @dataclass(frozen=True)
 class AdapterDown:
-    """The adapter failed or the process died; the adapter will be opened again."""
+    """The adapter failed, the process died, or the copy of the plant's recipe is damaged; all are
+    tried again.
+    """
 
     reason: str
 
@@ -195,7 +198,7 @@ class Ask:
 
 @dataclass(frozen=True)
 class CannotWork:
-    """The process ends and must not be restarted: the recipe changed or a setting is wrong."""
+    """The process ends and must not be restarted: a local recipe changed or a setting is wrong."""
 
     reason: str
 

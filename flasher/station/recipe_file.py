@@ -46,6 +46,10 @@ from flasher.station.recipe import (
 )
 from flasher.station.records.model import Signature, Verified
 
+DAMAGED_COPY: Final = text(
+    "The copy of a recipe from the plant is damaged. It is fetched again when the server can be"
+    " reached."
+)
 _SAMPLE_LOT: Final = "LOT1"
 
 

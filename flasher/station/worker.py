@@ -51,7 +51,7 @@ from flasher.station.messages import (
 )
 from flasher.station.power import PowerCommand, PowerControl
 from flasher.station.presence import BLIND_S, Presence
-from flasher.station.recipe_file import LoadedRecipe, load_recipe
+from flasher.station.recipe_file import DAMAGED_COPY, LoadedRecipe, load_recipe
 from flasher.station.records.model import Claim, Measurement, RunState
 from flasher.station.unit_run import UnitRun
 from flasher.station.virtual_units import VirtualSocket
@@ -59,6 +59,8 @@ from flasher.trace.recorder import Recorder
 
 REOPEN_S: Final = 1.0
 """Interval between attempts to reopen a failed adapter."""
+RELOAD_S: Final = 5.0
+"""Interval between attempts to load the plant's recipe again, which reads all of its files."""
 BEAT_S: Final = 0.5
 """Interval between heartbeats."""
 IDLE_S: Final = 0.05
@@ -388,10 +390,32 @@ def open_socket(
 
 def load_same(setup: WorkerSetup) -> LoadedRecipe:
     """Load the recipe. Raises UsageError if it differs from the station's."""
-    recipe = load_recipe(setup.recipe, may_waive=setup.may_waive)
+    recipe = load_recipe(setup.recipe, may_waive=not setup.is_from_plant)
     if {str(path): sha256 for path, sha256 in recipe.files.items()} != dict(setup.files):
-        raise UsageError("The recipe, or a file that it names, was changed.")
+        changed = "The recipe, or a file that it names, was changed."
+        raise UsageError(DAMAGED_COPY if setup.is_from_plant else changed)
     return recipe
+
+
+def load_when_whole(pipe: StationPipe, setup: WorkerSetup) -> LoadedRecipe | None:
+    """Load the recipe; None if the socket cannot work, or the process has to end. The plant's is
+    tried again: its copy is fetched again.
+
+    Raises StationGoneError.
+    """
+    is_down = False
+    while not pipe.is_over:
+        try:
+            return load_same(setup)
+        except FlasherError as error:
+            if not setup.is_from_plant:
+                pipe.send(CannotWork(error.what))
+                return None
+            if not is_down:
+                pipe.send(AdapterDown(error.what))
+            is_down = True
+            pipe.wait(RELOAD_S)
+    return None
 
 
 def work_on(
@@ -425,9 +449,6 @@ def worker_main(channel: Channel, setup: WorkerSetup) -> None:
             signal.signal(getattr(signal, name), signal.SIG_IGN)
     pipe = StationPipe(channel, time.perf_counter)
     with suppress(StationGoneError):
-        try:
-            recipe = load_same(setup)
-        except FlasherError as error:
-            pipe.send(CannotWork(error.what))
-            return
-        work_on(pipe, setup, recipe, partial(open_socket, setup, recipe))
+        recipe = load_when_whole(pipe, setup)
+        if recipe is not None:
+            work_on(pipe, setup, recipe, partial(open_socket, setup, recipe))

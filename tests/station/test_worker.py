@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import pairwise
 from math import inf
 from pathlib import Path
@@ -47,7 +48,7 @@ from flasher.station.records.model import Claim, RunId, RunKind, RunState, Write
 from flasher.station.unit_run import UnitRun
 from flasher.station.unit_steps import UnitSteps
 from flasher.station.virtual_units import Health, VirtualSocket, make_device
-from flasher.station.worker import StationPipe, Worker, load_same, work_on
+from flasher.station.worker import StationPipe, Worker, load_same, load_when_whole, work_on
 from tests.loops import each
 from tests.station.factory import DAY, USUAL, make_recipe
 from tests.station.unit_bench import WRITES
@@ -288,6 +289,43 @@ def test_a_socket_that_cannot_be_used_is_told_and_not_tried_again(tmp_path: Path
         raise UsageError("There is no such interface.")
 
     work_on(socket.line, socket.setup, socket.recipe, opened)
+    assert socket.kinds == ["CannotWork"]
+
+
+def test_a_damaged_copy_of_the_plants_recipe_is_reported_once_and_loaded_when_it_is_whole(
+    tmp_path: Path,
+) -> None:
+    socket = RealAdapter(tmp_path)
+    file, poll = tmp_path / "bms.bin.toml", socket.channel.poll
+    whole = file.read_bytes()
+    file.write_bytes(whole + b"\n")
+
+    def fetched_after_7_s(timeout: float = 0.0) -> bool:
+        if socket.clock.now() > 7.0:
+            file.write_bytes(whole)
+        return poll(timeout)
+
+    vars(socket.channel)["poll"] = fetched_after_7_s
+    loaded = load_when_whole(socket.line, replace(socket.setup, is_from_plant=True))
+    assert loaded is not None
+    assert loaded.files == socket.recipe.files
+    assert socket.kinds == ["AdapterDown"]
+    assert "is fetched again" in socket.channel.of(AdapterDown)[0].reason
+    assert socket.clock.now() == pytest.approx(10.0, abs=0.2)
+
+
+def test_a_damaged_copy_is_not_waited_for_when_another_recipe_was_approved(tmp_path: Path) -> None:
+    socket = RealAdapter(tmp_path)
+    (tmp_path / "bms.bin.toml").unlink()
+    socket.channel.waiting.append(Quit())
+    assert load_when_whole(socket.line, replace(socket.setup, is_from_plant=True)) is None
+    assert socket.kinds == ["AdapterDown"]
+
+
+def test_a_local_recipe_that_was_changed_is_not_tried_again(tmp_path: Path) -> None:
+    socket = RealAdapter(tmp_path)
+    (tmp_path / "bms.bin.toml").unlink()
+    assert load_when_whole(socket.line, socket.setup) is None
     assert socket.kinds == ["CannotWork"]
 
 
