@@ -125,8 +125,11 @@ class Bench:
 
     @property
     def firmware(self) -> Firmware:
-        """Images for cases about content and size."""
-        return self.subject.firmware
+        """Images for cases about content and size, short ones where the device takes no larger."""
+        firmware = self.subject.firmware
+        if len(firmware.good) > self.number("largest_image_bytes"):
+            return Firmware(self.good_image, self.subject.second_image)
+        return firmware
 
     def padded(self, size_bytes: int) -> bytes:
         """The good image padded with FF to `size_bytes`, with a new checksum where the product's
@@ -188,20 +191,22 @@ class Bench:
 
     def update(self, size_bytes: int) -> Received:
         """Send the update command, repeated at every boot version (R2), until request transfer."""
-        limit_s = self.limit("erase_s")
-        reply: Received | None = None
+        found = self.request_transfer(size_bytes)
+        return self.require_received(found, Reply.REQUEST.value, self.limit("erase_s"))
+
+    def request_transfer(self, size_bytes: int) -> Received | None:
+        """Like `update`, for an image that the device may reject; then returns None."""
         for tries in range(1, UPDATES_MAX + 1):
             self.update_tries = tries
             sent = self.send(self.encoder.update(size_bytes))
-            reply = self.host.request_or_version(sent.left_at, limit_s)
-            if reply is None or reply.kind is Reply.REQUEST:
+            reply = self.host.request_or_version(sent.left_at, self.limit("erase_s"))
+            if reply is None:
                 break
-        if reply is not None and reply.kind is not Reply.REQUEST:
-            reply = None
-        found = self.require_received(reply, Reply.REQUEST.value, limit_s)
-        self.measure(TimeName.REQUEST, found.at - sent.left_at)
-        self.continued_at = found.at
-        return found
+            if reply.kind is Reply.REQUEST:
+                self.measure(TimeName.REQUEST, reply.at - sent.left_at)
+                self.continued_at = reply.at
+                return reply
+        return None
 
     def update_again(self, size_bytes: int, *, may_be_whole: bool = False) -> None:
         """Get request transfer after a transfer that was broken off or refused: from the waiting

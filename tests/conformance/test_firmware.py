@@ -17,6 +17,7 @@ from flasher.conformance.mock import (
     model_image,
     profile_of_mock,
 )
+from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.runner import RunObserver, run
 from flasher.conformance.wire import version_in
 from flasher.mock.store import checksum_fits
@@ -59,6 +60,15 @@ def test_a_device_with_too_little_room_is_tested_with_short_images() -> None:
     assert make_firmware(model_image, 8192, 3 * 8192 - 1) is None
     small = subject(profile=replace(MOCK_PROFILE, application_area_bytes=4096))
     assert small.firmware == (GOOD_IMAGE, SECOND_IMAGE, ())
+
+
+@each("less_bytes, is_short", ((0, False), (1, True)))
+def test_images_are_no_larger_than_the_profile_allows(less_bytes: int, is_short: bool) -> None:
+    device = subject()
+    largest_bytes = len(device.firmware.good) - less_bytes
+    profile = ConformanceProfile({"device.largest_image_bytes": largest_bytes})
+    wanted = (GOOD_IMAGE, SECOND_IMAGE, ()) if is_short else device.firmware
+    assert Bench(device, profile, limit_s=100.0).firmware == wanted
 
 
 class Restores(RunObserver):

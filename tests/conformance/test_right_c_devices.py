@@ -10,6 +10,7 @@ import sys
 
 import pytest
 
+from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import Selection
 from flasher.conformance.dut.process import BootloaderProcess
 from flasher.conformance.explore import Explorer
@@ -17,6 +18,7 @@ from flasher.conformance.init import ask_device
 from flasher.conformance.profile import ConformanceProfile, Value
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
+from flasher.conformance.wire import Reply
 from tests.campaigns.profiles import faults as profile_faults
 from tests.campaigns.right_c_devices import right_c_device
 from tests.campaigns.right_c_in_process import LoadedBootloader
@@ -55,11 +57,25 @@ def test_a_seed_makes_the_same_device_again() -> None:
         (2, "FR-09"),  # an empty frame splits a message
         (32, "CO-04"),  # a burst of one, and deaf before it
         (54, "TX-12"),  # after a pause it takes its time to announce itself
+        (73, "EN-01"),  # its largest image is smaller than its application area
         (33, "BU-01"),  # what came soon after half an end of transfer belonged to that
     ),
 )
 def test_a_freedom_of_the_document_passes(seed: int, case_id: str) -> None:
     assert faults_of(seed, Selection(cases=(case_id,)), make=right_c_device) == []
+
+
+def test_an_update_command_that_comes_last_in_the_burst_is_answered_after_it() -> None:
+    """By a bootloader that processes it after its burst, and listens there without application."""
+    device = right_c_device(66)
+    with device.subject() as subject:
+        bench = Bench(subject, device.profiles["fitting"], limit_s=100.0)
+        bench.start_transfer(len(bench.good_image))
+        bench.await_message(Reply.BOOT_VERSION, within_s=2 * bench.limit("pause_s"))
+        bench.wait(bench.limit("version_spacing_s") / 2)
+        bench.send(bench.encoder.update(len(bench.good_image)))
+        bench.next_version()
+        bench.await_message(Reply.REQUEST)
 
 
 def test_the_start_of_an_application_counts_from_the_end_of_the_window_in_walks() -> None:
@@ -159,6 +175,10 @@ def test_an_application_may_start_later_than_an_erase_ends() -> None:
         (11, {}, {"limits.inter_frame_s": 0.16, "tx_01_lost_frame": "silence"}),
         # Only a lost frame is answered by NAK, late.
         (12, {}, {"tx_01_lost_frame": "nak", "limits.ack_s": 1.5}),
+        # The larger image that the cases use is larger than any that it accepts.
+        (73, {}, {"en_03": "starts", "device.largest_image_bytes": 5005}),
+        # The wait for its answer to a lost frame becomes a pause, and it is deaf in its burst.
+        (66, {"BURST_HEARS": 0}, {"tx_01_lost_frame": "silence", "up_04_burst": "rejected"}),
         # After a pause of 9 s it takes another 1.4 s to announce itself.
         (13, {}, {"limits.pause_s": 8.6}),
     ),

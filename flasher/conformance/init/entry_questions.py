@@ -112,7 +112,9 @@ def _measure_larger_image(session: InitSession) -> None:
     if len(image) <= len(session.image):
         return
     session.enter()
-    bench.update(len(image))
+    if bench.request_transfer(len(image)) is None:  # larger than any that it accepts
+        session.await_application()
+        return
     bench.packets(image)
     bench.end_transfer()
     session.await_application(TimeName.START if query else "", bench.now)

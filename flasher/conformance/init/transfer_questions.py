@@ -16,6 +16,7 @@ from flasher.conformance.results import KeyAnswer
 from flasher.conformance.wire import (
     PACKET_BYTES,
     RawFrame,
+    Received,
     Reply,
     joined,
     packet_count,
@@ -132,22 +133,24 @@ def lost_frame(session: InitSession) -> Findings:
             bench.forget()
             frames = session.frames()
             sent = bench.send(frames[:index] + frames[index + 1 :])
-            replies = bench.answers()
-            late = bench.collect(_LATER_S)
-            has_left = any(one.kind is Reply.BOOT_VERSION for one in (*replies, *late))
-            replies, late = (
-                [one for one in each if one.kind is not Reply.BOOT_VERSION]
-                for each in (replies, late)
-            )
-            for one in (*replies, *late):
+            late_at = bench.now + bench.waits.settle_s
+            until = late_at + _LATER_S
+            replies, has_left = list[Received](), False
+            while (one := bench.next_message(until - bench.now)) is not None:
+                has_left = one.kind is Reply.BOOT_VERSION
+                if has_left:  # an update command later in the burst may not be received
+                    break
+                replies.append(one)
+                until = min(until, bench.now + _LATER_S)
                 if one.kind is Reply.NAK:  # counted from when the device may notice the gap
                     noticed_at = sent.left_at + bench.limit("inter_frame_s")
                     bench.measure(TimeName.REJECTED, max(one.at - noticed_at, 0.0))
-            kinds = [one.kind for one in (*replies, *late)]
+            kinds = [one.kind for one in replies]
             value = {0: "silence", 1: "nak"}.get(len(kinds), "")
             if kinds not in ([], [Reply.NAK]):
                 value = ""
-            answer = answer_text([*replies, *late]) + (", late" if late else "")
+            is_late = any(one.at > late_at for one in replies)
+            answer = answer_text(replies) + (", late" if is_late else "")
             stimulus = f"a packet without its frame {index + 1}"
             yield Trial(value, answer.replace(f" {session.stored + 1}", ""), stimulus)
             if has_left:

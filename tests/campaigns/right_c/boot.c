@@ -411,9 +411,9 @@ static void flow(void)
                 due += SPACING_US;
                 if (announced >= BURST && runnable)
                     due = now + WINDOW_US;
-                else if (announced >= BURST && LISTENS)
+                else if (announced >= BURST && !size && LISTENS)
                     due = NEVER;
-                else if (announced >= BURST && announced % BURST == 0)
+                else if (announced >= BURST && !size && announced % BURST == 0)
                     due += GAP_US;
                 continue;
             }
