@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import html
 import re
 import struct
@@ -51,6 +50,7 @@ from tests.station.test_labels import template
 from tests.station.unit_bench import NEW_UNIT, UnitBench
 from tests.web.answering import app_of, client_of
 from tests.web.bench_place import BenchPlace, order
+from tests.web.own_loop import in_own_loop
 
 FOREIGN = tuple(code for code in NAMES if code != "en")
 _ENGLISH = re.compile(r"(?:\b[A-Za-z]?[a-z]+[,;:]? ){2,}[a-z]{2,}\b")
@@ -245,7 +245,7 @@ def _line_pages(line: LineBench) -> dict[str, str]:
 
     return {
         language: "".join(
-            f"<p>{html.escape(text)}</p>" for text in _strings(asyncio.run(messages_in(language)))
+            f"<p>{html.escape(text)}</p>" for text in _strings(in_own_loop(messages_in(language)))
         )
         for language in NAMES
     }
