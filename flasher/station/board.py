@@ -163,7 +163,8 @@ class Board:
     """Labels of all virtual units so far."""
     virtual_sockets: tuple[str, ...] = ()
     broken: dict[str, str] = field(default_factory=dict)
-    """Reasons of the sockets that will not work until the station is restarted, by socket."""
+    """Reasons of the sockets that will not work until the station is restarted or they get another
+    recipe, by socket."""
 
     @property
     def last_reply(self) -> str:
@@ -229,6 +230,7 @@ class Board:
             self.title = f"{self.virtual_words} {self.title}"
 
     def _recipe_changed(self, event: RecipeChanged) -> None:
+        self.broken.pop(event.socket, None)  # a process with this recipe is started
         self.recipes[event.socket] = printable(f"{event.recipe}, {event.revision}")
         names = dict.fromkeys(self.recipes.values())
         self.recipe, self.part = next(iter(names)), printable(event.part)

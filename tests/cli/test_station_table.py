@@ -28,6 +28,7 @@ from flasher.station.events import (
     LineStopped,
     OperatorPrompted,
     Progressed,
+    RecipeChanged,
     RunEnded,
     RunStarted,
     ScanAccepted,
@@ -222,6 +223,8 @@ def test_a_socket_that_is_not_started_again_is_broken() -> None:
     assert not board.broken
     board.apply(WorkerFailed("1", "the recipe changed", None))  # type: ignore[arg-type, unused-ignore]
     assert board.broken == {"1": "the recipe changed"}
+    board.apply(RecipeChanged("1", "Battery 36 V", "5", "BP", "ab" * 32))
+    assert not board.broken, "its process is started with the other recipe"
 
 
 # -- keys and files --------------------------------------------------------------------------------
