@@ -6,11 +6,11 @@ import asyncio
 import hashlib
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Concatenate, ParamSpec
 
-from flasher.api import Connection, Job
+from flasher.api import Job
 from flasher.cli.look.backup import backup_folder
 from flasher.cli.options import Bus
 from flasher.cli.output import Output
@@ -24,7 +24,6 @@ from flasher.settings.manifest import manifest_path, to_toml
 from flasher.web.archive import PAGES as KEPT
 from flasher.web.archive import Archive
 from flasher.web.bench import BenchController, Order
-from flasher.web.bench_backend import UpgradeEnding
 from flasher.web.bench_compare import watch_compared
 from flasher.web.bench_page import BenchPage, Shelf, upload_limit
 from flasher.web.bench_state import Adapter, BenchState
@@ -62,28 +61,14 @@ class HeldBikes(VirtualBikes):
 
     hold: Callable[[object], None] = staticmethod(lambda _event: None)
 
-    def upgrade(
-        self,
-        adapter: Adapter,
-        job: Job,
-        connect: Callable[[], AbstractContextManager[Connection]],
-        *,
-        keeps_settings: bool,
-        on_event: Callable[[object], None],
-        cancelled: Callable[[], bool],
-    ) -> UpgradeEnding:
+    def _listener(
+        self, adapter: Adapter, job: Job, on_event: Callable[[object], None]
+    ) -> Callable[[object], None]:
         def held(event: object) -> None:
             on_event(event)
             self.hold(event)
 
-        return super().upgrade(
-            adapter,
-            job,
-            connect,
-            keeps_settings=keeps_settings,
-            on_event=held,
-            cancelled=cancelled,
-        )
+        return super()._listener(adapter, job, held)
 
 
 def order(
