@@ -15,7 +15,11 @@ from flasher.conformance.catalogue import Selection
 from flasher.conformance.dut.process import BootloaderProcess
 from flasher.conformance.explore import Explorer
 from flasher.conformance.init import ask_device
+from flasher.conformance.init.answers import Trial
+from flasher.conformance.init.session import InitSession
+from flasher.conformance.init.transfer_questions import padded
 from flasher.conformance.profile import ConformanceProfile, Value
+from flasher.conformance.restore import restore
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
 from flasher.conformance.wire import Reply
@@ -200,6 +204,17 @@ def test_an_image_may_be_refused_much_later_than_init_saw_the_good_one_confirmed
 def test_a_pause_that_counts_from_a_packet_ends_sooner_after_a_late_ack() -> None:
     """`init` sees it after 2.0 to 2.5 s, and its own waits become one (tx_01_lost_frame)."""
     assert profile_faults(24, Selection(cases=("TX-12",)), make=right_c_device) == []
+
+
+def test_a_restart_after_a_pause_may_end_later_than_complete_would_come() -> None:
+    """It rejects a padded end of transfer, and after 9 s takes 2 s to announce itself."""
+    device = right_c_device(99)
+    profile = device.profiles["fitting"]
+    with device.subject() as subject:
+        assert restore(subject, profile, flash=True).ok
+        session = InitSession(subject, profile, lambda: False)
+        found = list(padded(session))
+    assert {one.value for one in found if isinstance(one, Trial)} == {"rejected"}
 
 
 def test_init_leaves_open_whether_end_of_transfer_erases_the_application_without_power() -> None:

@@ -239,8 +239,11 @@ def padded(session: InitSession) -> Findings:
         session.packets()
         bench.forget()
         sent = bench.send(padded_to_frame(bench.encoder.end(), byte))
-        # Without complete, the transfer lasts, or ends by a pause.
-        reply = bench.wait_for(Reply.COMPLETE, Reply.BOOT_VERSION)
+        # Without complete, the transfer lasts, or ends by a pause and a restart.
+        within_s = bench.limit("complete_s")
+        if bench.profile.allows("tx_12", "announces"):
+            within_s = max(within_s, bench.limit("pause_s") + bench.limit("first_version_s"))
+        reply = bench.wait_for(Reply.COMPLETE, Reply.BOOT_VERSION, within_s=within_s)
         taken = reply is not None and reply.kind is Reply.COMPLETE
         yield _accepted_trial(taken, f"end {form}", "ignored", "rejected")
         if reply is not None and taken:
