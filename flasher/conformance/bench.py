@@ -204,7 +204,8 @@ class Bench:
                 break
             if reply.kind is Reply.REQUEST:
                 self.measure(TimeName.REQUEST, reply.at - sent.left_at)
-                self.continued_at = reply.at
+                # The request may have waited for NAKs of update commands before it.
+                self.continued_at = max(sent.left_at, reply.at - self.limit("ack_s"))
                 return reply
         return None
 
@@ -294,6 +295,12 @@ class Bench:
         `for_s` more have passed.
         """
         return self.now + for_s >= self.continued_at + self.limit("pause_s")
+
+    def before_pause_s(self, for_s: float) -> float:
+        """As much of `for_s` as is left before the silence becomes a pause (TX-12)."""
+        if self.choice("tx_12") == "waits":
+            return for_s
+        return max(0.0, min(for_s, self.continued_at + self.limit("pause_s") - self.now))
 
     def stay_before(self, image: bytes, number: int) -> None:
         """Where packet `number` of `image` is next: when a pause may end the transfer before a

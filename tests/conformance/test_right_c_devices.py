@@ -61,6 +61,7 @@ def test_a_seed_makes_the_same_device_again() -> None:
         (2, "FR-09"),  # an empty frame splits a message
         (32, "CO-04"),  # a burst of one, and deaf before it
         (54, "TX-12"),  # after a pause it takes its time to announce itself
+        (91, "CR-02"),  # its request transfer waits for NAKs, the pause counts from the command
         (73, "EN-01"),  # its largest image is smaller than its application area
         (33, "BU-01"),  # what came soon after half an end of transfer belonged to that
     ),
@@ -199,6 +200,17 @@ def test_init_finds(seed: int, changed: dict[str, int], wanted: dict[str, Value 
 def test_an_image_may_be_refused_much_later_than_init_saw_the_good_one_confirmed() -> None:
     """After 10 s, where complete follows at once."""
     assert profile_faults(17, Selection(cases=("TX-07",)), make=right_c_device) == []
+
+
+def test_limits_may_be_longer_than_the_pause() -> None:
+    given = dict(right_c_device(89).profiles["fitting"].given)
+    # The wait for the last answer to damaged packets.
+    given |= {"limits.pause_s": 1.1, "limits.ack_s": 1.5, "limits.inter_frame_s": 0.09}
+    assert verdict(89, "CR-03", given) in HELD
+    given = dict(right_c_device(86).profiles["fitting"].given)
+    # Off the bus it misses end of transfer, and restarts while complete may still come.
+    given |= {"limits.complete_s": 29.0, "limits.ack_s": 0.87, "limits.inter_frame_s": 0.09}
+    assert verdict(86, "BU-02", given) in HELD
 
 
 def test_a_pause_that_counts_from_a_packet_ends_sooner_after_a_late_ack() -> None:

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, Requirement, case
-from flasher.conformance.patient_host import is_leftover
+from flasher.conformance.patient_host import REJECTED, RESTARTED, is_leftover
 from flasher.conformance.tester import FaultKind, LineFault, Sent
 from flasher.conformance.wire import (
     ACK,
@@ -199,13 +199,15 @@ def _upgrade_disturbed(bench: Bench, make: Callable[[int], Iterator[_Disturbance
         "packet": deque(make(len(encoder.packet_of(image, 1)))),
         "end of transfer": deque(make(len(encoder.end()))),
     }
-    for _ in range(1 + max(map(len, left.values()))):
-        if not any(left.values()):
-            break
+    done = False
+    for _ in range(2 + max(map(len, left.values()))):
         _enter(bench, image, left)
-        if _send_packets(bench, image, left) and _end(bench, image, left):
+        is_whole = _send_packets(bench, image, left) and _end(bench, image, left)
+        if is_whole:
             bench.check_image(image)
-    done = not any(left.values())
+        done = is_whole and not any(left.values())
+        if done:
+            break
     bench.check(done, "the upgrades are completed", "the device restarts in each one")
 
 
@@ -292,7 +294,7 @@ def _send_packets(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
 
 def _end(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
     """Send end of transfer with one fault after another until it is answered. False when the device
-    rejected the image explicitly, with two NAKs (R6).
+    rejected the image explicitly, with two NAKs (R6), or restarted without the image.
     """
     names: list[str] = []
     reply: Received | None = None
@@ -313,7 +315,7 @@ def _end(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
         done = bench.host.deliver_end(image)
     if not done.ok:
         bench.info(f"{done.reason}: {'; '.join(names)}")
-    return "rejected" not in done.reason
+    return done.reason not in (REJECTED, RESTARTED)
 
 
 # -- another device -------------------------------------------------------------------------------

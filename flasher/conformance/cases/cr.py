@@ -114,7 +114,7 @@ def bursts(bench: Bench) -> None:
             frames = probe.frames()
             with bench.disturb(fault):
                 bench.send(frames)
-                replies = bench.collect(bench.waits.settle_s)
+                replies = _late_answers(bench)
             _require_none_accepted(bench, f"a packet whose {fault}", replies)
             bench.judge.note_stimulus(heard=bool(replies))
         bench.succeed(f"none of {len(faults)} packets is accepted", "none was")
@@ -382,7 +382,7 @@ def _check_none_accepted(
         name, damage = left.pop(0)
         probe.keep_alive()
         bench.send(bench.encoder.frames(damage(probe.raw())))
-        replies = bench.collect(bench.waits.settle_s)
+        replies = _late_answers(bench)
         _require_none_accepted(bench, f"a packet with {name}", replies)
         answers = bool(replies)
         bench.judge.note_stimulus(heard=answers)
@@ -397,14 +397,19 @@ def _check_none_accepted(
             one = bench.next_message(bench.limit("ack_s"))
             replies = [] if one is None else [one]
         else:
-            replies = bench.collect(bench.waits.settle_s)
+            replies = _late_answers(bench)
         first, last = batch[0][0], batch[-1][0]
         names = first if len(batch) == 1 else f"one of {len(batch)} damages, {first} to {last}"
         _require_none_accepted(bench, f"a packet with {names}", replies)
         bench.judge.note_stimulus(len(batch), heard=bool(replies))
     if left and framed and answers:  # else it was waited for
-        _require_none_accepted(bench, "the last ones", bench.collect(bench.waits.settle_s))
+        _require_none_accepted(bench, "the last ones", _late_answers(bench))
     bench.succeed(f"none of {len(damages)} packets is accepted", "none was")
+
+
+def _late_answers(bench: Bench) -> list[Received]:
+    """Messages until all damaged packets are answered, or a pause is near."""
+    return bench.collect(bench.before_pause_s(bench.waits.settle_s))
 
 
 def _require_none_accepted(bench: Bench, what: str, replies: Sequence[Received]) -> None:
