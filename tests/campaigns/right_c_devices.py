@@ -300,7 +300,9 @@ def _stated(choices: Choices) -> dict[str, Value]:
         stated["rs_03_old"] = "either"
     if not has("ERASING_HEARS") and not has("BEFORE_FIRST"):
         stated["up_05"] = "once"
-    if has("ERASING_HEARS") and has("BEFORE_FIRST"):
+    # It reads a frame a pass: after the erase of a sector the rest of a message may come too late.
+    is_quick = not has("ERASE_IN_PASSES") or has("ERASE_US") < has("FRAME_GAP_US")
+    if has("ERASING_HEARS") and has("BEFORE_FIRST") and is_quick:
         stated["up_05"] = "each"
     if min(has("START_US"), has("REFUSED_US")) < _HEARD_AGAIN_US:
         stated["en_02"] = "either"
