@@ -23,6 +23,7 @@ from flasher.settings.manifest import manifest_path
 from flasher.station.given_recipes import Bundle, RecipeFolder, bundle_of, parse_bundle
 from flasher.station.recipe import Recipe
 from flasher.station.recipe_file import LoadedRecipe
+from flasher.station.records.server import ServerLock
 
 PUBLISHED: Final = "published"
 WITHDRAWN: Final = "withdrawn"
@@ -84,6 +85,7 @@ def publish(
     facts = {"name": rule.name, "revision": rule.revision, "part": rule.part}
     with central.writing() as connection:
         _check_known(connection, stations, sockets)
+        ServerLock.PUBLISHING.hold(connection)  # two publishers would not see each other's rows
         _check_revision(connection, bundle.digest, rule)
         for sha256, data in contents.items():
             connection.execute(

@@ -8,6 +8,7 @@ import hashlib
 import os
 import random
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,6 +18,7 @@ import psycopg
 import pytest
 
 from flasher.errors import UsageError
+from flasher.plant import recipes
 from flasher.plant.central import Central
 from flasher.plant.fetcher import Fetcher
 from flasher.plant.recipes import events_of, publish, withdraw
@@ -180,6 +182,31 @@ def test_a_revision_is_published_with_one_content(centre: Centre) -> None:
     assert centre.publish(REVISION_5) == digest
     centre.publish(other.replace('"5"', '"6"'))
     assert len(events_of(centre.central)) == 4
+
+
+def test_two_publishers_at_one_moment_do_not_publish_two_contents(
+    centre: Centre, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = make_recipe(centre.source, REVISION_5)
+    (tmp_path / "other").mkdir()
+    second = make_recipe(tmp_path / "other", REVISION_5 + "\n[lot]\nrequired = true\n")
+    waiting = "SELECT count(*) FROM pg_locks WHERE NOT granted"
+    check = recipes._check_revision
+    with ThreadPoolExecutor() as pool:
+        others: list[Future[Bundle]] = []
+
+        def check_before_the_other(*args: Any) -> None:
+            check(*args)
+            if not others:
+                others.append(pool.submit(publish, centre.central, second, (), (), DAY))
+                while not others[0].done() and centre.plant.rows(waiting) == [(0,)]:
+                    pass
+
+        monkeypatch.setattr(recipes, "_check_revision", check_before_the_other)
+        digest = publish(centre.central, first, (), (), DAY).digest
+        with pytest.raises(UsageError, match=f"other content: {digest[:16]}"):
+            others[0].result()
+    assert [each.digest for each in events_of(centre.central)] == [digest]
 
 
 def test_what_the_owner_of_the_database_alters_is_not_taken(centre: Centre) -> None:

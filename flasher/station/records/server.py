@@ -34,6 +34,8 @@ class ServerLock(IntEnum):
     """A retired month is deleted."""
     UNIT = 7055
     """A unit is claimed: seed of the hash of its part and serial number."""
+    PUBLISHING = 7056
+    """A recipe is published: its revision is compared with those that are published."""
 
     def hold(self, connection: Connection) -> None:
         """Wait for the lock; it ends with the transaction."""
