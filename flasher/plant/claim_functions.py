@@ -5,7 +5,8 @@ A claim stays until its station sends the end of the run, or releases it because
 expires if its station does not renew it; from then on it refuses the unit nowhere, but the station
 may have passed the unit, which `plant_claim` states. So a unit is reported as free only while no
 run of it at another station can end with a PASS that is not here. The owner of the database can
-release an expired claim; a run with it that arrives later is marked (`claim_list`).
+release an expired claim; a run with it that arrives later is marked (`claim_list`), and its station
+learns of it (`plant_released`).
 
 A PC that was taken over may have passed units that it never sent: to the PC that continues the
 station its claims are those of another station, and it can claim nothing.
@@ -16,7 +17,7 @@ from __future__ import annotations
 from typing import Final
 
 from flasher.plant.functions import DEFINER, REFUSED
-from flasher.station.records.model import PLANT_CLAIM, RunKind, StepName
+from flasher.station.records.model import PLANT_CLAIM, AuditEvent, RunKind, StepName
 from flasher.station.records.server import ServerLock
 
 NO_STATION: Final = "a station whose records were replaced"
@@ -123,6 +124,18 @@ $$
 """
 """Claims of the station itself, and of PCs that were this station before a takeover."""
 
+_RELEASED: Final = f"""
+CREATE OR REPLACE FUNCTION plant_released() RETURNS TABLE (token text, part text, serial text)
+LANGUAGE sql STABLE {DEFINER} AS $$
+    SELECT c.token, c.part, c.serial FROM released_claim c
+        WHERE c.station = plant_my_station() AND c.run_id IS NOT NULL AND NOT EXISTS (
+            SELECT FROM chain_row o WHERE o.station = c.station AND o.run_id = c.run_id
+                AND o.event = '{AuditEvent.CLAIM_RELEASED}')
+$$
+"""
+"""Claims of the station that were released before the end of their run arrived, until its audit
+trail has that."""
+
 _END: Final = f"""
 CREATE OR REPLACE FUNCTION plant_end_claims() RETURNS trigger LANGUAGE plpgsql {DEFINER} AS $$
 DECLARE
@@ -158,7 +171,7 @@ CREATE TRIGGER plant_end_claims AFTER INSERT ON chain_row FOR EACH ROW
     WHEN (NEW.content IS NOT NULL) EXECUTE FUNCTION plant_end_claims();
 """
 
-FUNCTIONS: Final = (_OLD, _CLAIM, _RENEW, _RELEASE, _CLAIMS, _END, _TRIGGER)
+FUNCTIONS: Final = (_OLD, _CLAIM, _RENEW, _RELEASE, _CLAIMS, _RELEASED, _END, _TRIGGER)
 
 
 def rights(stations: str) -> str:
@@ -166,5 +179,6 @@ def rights(stations: str) -> str:
     return f"""
 GRANT EXECUTE ON FUNCTION
     plant_claim(text, text, text, boolean, text, double precision, text, text),
-    plant_renew(text[], double precision), plant_release(text[]), plant_claims() TO {stations};
+    plant_renew(text[], double precision), plant_release(text[]), plant_claims(), plant_released()
+    TO {stations};
 """

@@ -18,10 +18,7 @@ from sqlalchemy import Connection, text
 
 from flasher.errors import UsageError
 from flasher.plant.central import Central
-from flasher.station.records.model import CHECKED
 
-RELEASED_MARK: Final = f"not {CHECKED}: its claim was released"
-"""Mark of a run that arrived after its claim was released; as `ReportedRun.duplicates`."""
 RELEASES_MAX: Final = 100
 """Releases that are listed."""
 _CONDITIONS: Final = {

@@ -27,6 +27,7 @@ from flasher.station.records.model import (
     Elsewhere,
     ElsewhereState,
     Order,
+    RunId,
     StationClock,
     utc_text,
 )
@@ -50,6 +51,7 @@ _RENEW: Final = text("SELECT plant_renew(:tokens, :lease_s)")
 _RELEASE: Final = text("SELECT plant_release(:tokens)")
 _NOW: Final = text("SELECT clock_timestamp()")
 _CLAIMS: Final = text("SELECT * FROM plant_claims()")
+_RELEASED: Final = text("SELECT * FROM plant_released()")
 
 
 def clock_offset_s(central: Central, clock: StationClock) -> float:
@@ -106,6 +108,8 @@ class PlantClaims:
         self._kept: set[str] = set()
         self._left: set[str] = set()
         """Claims with which no run began."""
+        self._released: set[RunId] = set()
+        """Runs whose claim the plant has released, until they are taken."""
         self._is_swept = False
         self._own: _Own | None = None
         """None before this station has stated it."""
@@ -174,6 +178,11 @@ class PlantClaims:
             self._left.add(token)
         self._poke.set()
 
+    def take_released(self) -> set[RunId]:
+        with self._mutex:
+            found, self._released = self._released, set()
+        return found
+
     def close(self) -> None:
         self._is_over = True
         self._poke.set()
@@ -185,7 +194,9 @@ class PlantClaims:
     # -- keeping ----------------------------------------------------------------------------------
 
     def tend(self) -> None:
-        """Renew the claims, and release those that are not needed."""
+        """Renew the claims, release those that are not needed, and learn which ones the plant has
+        released.
+        """
         with self._mutex:
             kept, left = sorted(self._kept), sorted(self._left)
         try:
@@ -197,6 +208,8 @@ class PlantClaims:
                     central.execute(_RELEASE, {"tokens": left})
                 central.execute(_RENEW, {"tokens": kept, "lease_s": LEASE_S})
                 clocks = _compared(central, self._clock)
+                released = central.execute(_RELEASED).all()
+            runs = {self._recorded(each.part, each.serial).get(each.token) for each in released}
         except RecordError as error:
             with self._mutex:
                 self._fault = error
@@ -206,6 +219,7 @@ class PlantClaims:
             self._is_swept = True
             self._asked.clear()
             self._left.difference_update(left)
+            self._released |= {run_id for run_id in runs if run_id is not None}
             self._fault = None
 
     def _enter(self, central: Connection) -> _Own:
@@ -240,11 +254,11 @@ class PlantClaims:
             if each.token not in self._recorded(each.part, each.serial)
         ]
 
-    def _recorded(self, part: str, serial: str) -> set[str]:
-        """Claims of the recorded runs of a unit."""
+    def _recorded(self, part: str, serial: str) -> dict[str, RunId]:
+        """The recorded runs of a unit by their claim."""
         run, step, measurement = schema.run, schema.step, schema.measurement
         query = (
-            select(measurement.c.text)
+            select(measurement.c.text, run.c.id)
             .join_from(schema.unit, run, run.c.unit_id == schema.unit.c.id)
             .join(step, step.c.run_id == run.c.id)
             .join(measurement, measurement.c.step_id == step.c.id)
@@ -256,7 +270,7 @@ class PlantClaims:
             )
         )
         with self._records.reading() as local:
-            return set(local.execute(query).scalars())
+            return {token: RunId(run_id) for token, run_id in local.execute(query)}
 
     def _keep(self) -> None:
         with closing(self._central):

@@ -14,11 +14,11 @@ from sqlalchemy import Connection, text
 
 from flasher.errors import UsageError
 from flasher.plant.central import Central
-from flasher.plant.claim_list import RELEASED_MARK, released_runs
+from flasher.plant.claim_list import released_runs
 from flasher.plant.queue import TASK
 from flasher.protocol.text import printable
 from flasher.station.records.errors import NotFoundError
-from flasher.station.records.model import RunDetails
+from flasher.station.records.model import RELEASED_MARK, RunDetails
 from flasher.station.records.queries import details_of
 from flasher.station.records.schema import run
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final, NoReturn
@@ -18,7 +18,7 @@ from sqlalchemy import Connection, func, select, text
 from flasher.errors import UsageError
 from flasher.plant.archive import month_after
 from flasher.plant.central import open_central, plant_location
-from flasher.plant.claim_list import RELEASED_MARK, released_runs
+from flasher.plant.claim_list import released_runs
 from flasher.plant.schema import SHARED_PARTS, archive_file, shared_part, trace
 from flasher.station.records.database import Database, Location, locate, open_database
 from flasher.station.records.errors import RecordsDamagedError
@@ -27,9 +27,9 @@ from flasher.station.records.heads import ChainHead
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import (
     DUPLICATES,
+    RELEASED_MARK,
     PassedRun,
     PassedTwice,
-    ReportedRun,
     RunExamination,
     RunFilter,
     RunId,
@@ -135,14 +135,9 @@ class PlantFiles(FileStore):
 class PlantRecords(Records):
     """Queries of a plant's database. Certificates are a matter of the stations."""
 
-    def table(self, chosen: RunFilter = _EVERYTHING) -> list[ReportedRun]:
-        """The runs of a filter, with the mark of those whose claim was released."""
+    def released(self) -> set[int]:
         with self._database.reading() as connection:
-            released = released_runs(connection)
-        return [
-            replace(run, duplicates=RELEASED_MARK) if run.run_id in released else run
-            for run in super().table(chosen)
-        ]
+            return released_runs(connection)
 
     def head_of(self, run_id: RunId) -> ChainHead | None:
         _refuse_certificate()

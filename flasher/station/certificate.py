@@ -81,6 +81,8 @@ class Proof:
     content: Mapping[str, Any] = field(default_factory=dict)
     """Rows of the run, which the certificate contains."""
     row: Mapping[str, Any] = field(default_factory=dict)
+    is_released: bool = False
+    """The plant released the claim of the unit before it had the end of the run."""
     seal: str = ""
     """Signed lines of an existing certificate; "" to make them."""
 
@@ -110,6 +112,7 @@ def proven(store: Store, life: UnitLife) -> Proof:
         (found.examined_at or "")[:10],
         content,
         row,
+        last.run_id in store.read.released(),
     )
 
 
@@ -129,7 +132,8 @@ def sheet(life: UnitLife, made_at: datetime, proof: Proof, left_out: int = 0) ->
     if last is None:
         raise UsageError(text("{serial} has no run to certify.", serial=life.serial))
     status, word, sentence = UNIT_WORDS[life.state]
-    if life.is_virtual or last.run.is_unchecked:
+    is_unchecked = last.run.is_unchecked or proof.is_released
+    if life.is_virtual or is_unchecked:
         status = Status.WARNING  # never the colour of a product that passed
     earlier = life.runs[:-1]
     signatures = {target.signature for target in last.targets}
@@ -140,6 +144,7 @@ def sheet(life: UnitLife, made_at: datetime, proof: Proof, left_out: int = 0) ->
         "word": word,
         "sentence": sentence,
         "is_virtual": life.is_virtual,
+        "is_unchecked": is_unchecked,
         "head": proof.head,
         "key": fingerprint(proof.head.key) if proof.head else "",
         "is_kept": proof.is_kept,
@@ -194,6 +199,7 @@ def _seal(life: UnitLife, made_at: datetime, proof: Proof) -> str:
             key=proof.head.key,
             earlier=tuple(map(plain, earlier[-EARLIER_SHOWN:])),
             earlier_left_out=max(0, len(earlier) - EARLIER_SHOWN),
+            is_released=proof.is_released,
         )
     )
 

@@ -57,6 +57,7 @@ def check_certificate(store: Store, data: bytes) -> CheckedCertificate:
             sealed.is_kept,
             sealed.is_beside,
             sealed.examined_at,
+            is_released=sealed.is_released,
             seal=as_text(sealed),
         )
         left_out = sealed.earlier_left_out
@@ -127,6 +128,8 @@ def _in_records(store: Store, sealed: Sealed) -> tuple[list[str], tuple[str, ...
     last = store.read.run(run_id)
     if sealed.life().last != last:
         problems.append(text("its run differs from the run in the records"))
+    if run_id in store.read.released() and not sealed.is_released:
+        problems.append(text("the unit may have passed at another station, which was found later"))
     runs = [each.run for each in store.read.unit(last.run.serial, last.run.part).runs]
     before = [plain(run) for run in runs if run.run_id < run_id]
     stated = [dict(each) for each in sealed.earlier]

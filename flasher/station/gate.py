@@ -21,7 +21,7 @@ from flasher.errors import FlasherError
 from flasher.i18n import text
 from flasher.log import log_event
 from flasher.station.recipe import Recipe
-from flasher.station.records.model import Admission, Elsewhere, Order
+from flasher.station.records.model import Admission, Elsewhere, Order, RunId
 
 if TYPE_CHECKING:
     from flasher.station.question import Question
@@ -49,6 +49,11 @@ class Claims(Protocol):
 
     def dropped(self, token: str) -> None:
         """Release a claim with which no run began."""
+
+    def take_released(self) -> set[RunId]:
+        """Runs, found since the last call, whose claim the plant released before their end arrived
+        there: the unit may have passed at another station.
+        """
 
     def close(self) -> None:
         """Release what is left, for a moment."""
@@ -144,6 +149,10 @@ class Gate:
                 )
             )
         return found
+
+    def take_released(self) -> set[RunId]:
+        """As in `Claims`."""
+        return set() if self._claims is None else self._claims.take_released()
 
     def ended(self, admission: Admission | None) -> None:
         """The run of an admission has ended, and is in the station's records."""

@@ -64,6 +64,8 @@ class Sealed:
     """Earlier runs of the unit, not covered by the signature."""
     earlier_left_out: int
     """Number of earlier runs that are not in `earlier`."""
+    is_released: bool = False
+    """See `certificate.Proof`."""
 
     @property
     def head(self) -> ChainHead:
@@ -155,7 +157,10 @@ def plain(run: RunRecord) -> dict[str, Any]:
 
 def as_text(sealed: Sealed) -> str:
     """Encode the content as lines of text that survive printing: compressed, in base64."""
-    data = chain.canonical(_TYPE.dump_python(sealed, mode="json")).encode("ascii")
+    parts = _TYPE.dump_python(sealed, mode="json")
+    if not sealed.is_released:  # as in certificates of older versions
+        del parts["is_released"]
+    data = chain.canonical(parts).encode("ascii")
     text = base64.b64encode(zlib.compress(data, 9)).decode("ascii")
     lines = [text[at : at + _LINE] for at in range(0, len(text), _LINE)]
     return "\n".join([_BEGIN, *lines, _END])

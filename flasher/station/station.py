@@ -329,6 +329,16 @@ class Station:
         for order, admission in self._gate.take():
             self.line.answered(order, admission, self._now)
             self._carry_out()
+        if released := self._gate.take_released():
+            self._note_released(released)
+
+    def _note_released(self, run_ids: set[RunId]) -> None:
+        """Record which runs the plant marks. What is not saved is found again."""
+        try:
+            for run_id in sorted(run_ids - self.store.read.released()):
+                self.store.note(AuditEvent.CLAIM_RELEASED, {}, run_id)
+        except RecordError as error:
+            self._not_saved("", "", None, error)
 
     def close(self) -> None:
         """End all processes. Active runs are aborted, and saved if they report their end in time;

@@ -22,7 +22,6 @@ from flasher.plant.alerts import (
     lasting,
     overviews,
 )
-from flasher.plant.claim_list import RELEASED_MARK, released_runs
 from flasher.plant.deliveries import DeliveryState
 from flasher.plant.delivery_list import Delivery, DeliveryFilter, deliveries_of, receivers_of
 from flasher.station.records.overview import PAGE_SIZE, Page
@@ -62,10 +61,6 @@ class PlantPages(SupervisorPages):
     @property
     def names(self) -> Mapping[str, str]:
         return {STATIONS: text("Stations"), **super().names, DELIVERIES: text("Deliveries")}
-
-    def released(self) -> Mapping[int, str]:
-        with self.store.database.reading() as connection:
-            return dict.fromkeys(released_runs(connection), RELEASED_MARK)
 
     def stations(self, question: Question) -> Answer:
         """All stations with their checks; those with alerts first."""

@@ -41,6 +41,7 @@ from flasher.station.records.capability import VALUES_MIN
 from flasher.station.records.errors import NotFoundError, RecordError, UnprovenError
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import (
+    RELEASED_MARK,
     TORN_TRACE,
     TRACE,
     AttachmentFile,
@@ -163,8 +164,8 @@ class SupervisorPages:
         return self._page(question, "trouble.html", http=status, error=error, path="")
 
     def released(self) -> Mapping[int, str]:
-        """Marks of a plant's runs that arrived after the claim of their unit was released."""
-        return {}
+        """Marks of runs that reached the plant after the claim of their unit was released."""
+        return dict.fromkeys(self.store.read.released(), RELEASED_MARK)
 
     def _page(
         self, question: Question, template: str, *, http: int = 200, **context: Any

@@ -19,7 +19,7 @@ from flasher.plant import claims
 from flasher.plant.claims import LEASE_S, PlantClaims, _Own
 from flasher.station.gate import Gate
 from flasher.station.records.errors import RecordError
-from flasher.station.records.model import Admission, ElsewhereState, Order
+from flasher.station.records.model import Admission, ElsewhereState, Order, RunId
 from tests.station.factory import FakeClock
 
 PART, SERIAL = "BAT-36", "W2605002"
@@ -139,6 +139,8 @@ class _Link:
                 if each.station == station
             ]
             return SimpleNamespace(all=lambda: own)
+        elif statement is claims._RELEASED:
+            return SimpleNamespace(all=list)
         elif statement is claims._NOW:
             return SimpleNamespace(scalar_one=lambda: centre.clock.now)
         return None
@@ -156,8 +158,8 @@ class _Claims(PlantClaims):
         known = frozenset({self._of.takeover, *self._of.brought})
         return _Own("", self._of.takeover, known)
 
-    def _recorded(self, part: str, serial: str) -> set[str]:
-        return {run.claim for run in self._of.runs}
+    def _recorded(self, part: str, serial: str) -> dict[str, RunId]:
+        return {run.claim: RunId(run.number) for run in self._of.runs}
 
 
 class Station:

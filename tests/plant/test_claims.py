@@ -16,7 +16,6 @@ import pytest
 from flasher.errors import UsageError
 from flasher.plant.central import Central
 from flasher.plant.claim_list import (
-    RELEASED_MARK,
     ClaimFilter,
     claims_of,
     release,
@@ -29,7 +28,9 @@ from flasher.station.gate import Gate
 from flasher.station.records.errors import ClaimRefusedError, Refusal
 from flasher.station.records.model import (
     CHECKED,
+    RELEASED_MARK,
     Admission,
+    AuditEvent,
     Claim,
     Order,
     RunId,
@@ -522,6 +523,26 @@ def test_a_run_that_arrives_after_its_claim_was_released_is_marked(
     facts = (old.station, old.serial, old.reason, old.released_by, old.run_id, old.outcome)
     assert facts == ("line-2", SERIAL, "its disk is broken", OWNER, arrived, "PASS")
     assert run == gone.bench.store.read.table()[0].run_id
+
+
+def test_a_station_records_that_the_claim_of_its_run_was_released(
+    plant: Plant, lines: tuple[Line, Line]
+) -> None:
+    gone, _ = lines
+    run = gone.end(gone.claim())
+    gone.claim("W2605003")
+    expire(plant)
+    assert released(plant, station="line-2") == 2
+    gone.claims.tend()
+    assert gone.gate.take_released() == set(), "the plant has not the end of the run"
+    gone.sender.send()
+    gone.claims.tend()
+    assert gone.gate.take_released() == {run}
+    gone.bench.store.note(AuditEvent.CLAIM_RELEASED, {}, run)
+    assert gone.bench.store.read.released() == {run}
+    gone.sender.send()
+    gone.claims.tend()
+    assert gone.gate.take_released() == set(), "the plant knows that it knows"
 
 
 def test_a_claim_that_is_renewed_is_not_released(plant: Plant, lines: tuple[Line, Line]) -> None:

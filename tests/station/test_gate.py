@@ -10,7 +10,14 @@ import pytest
 
 from flasher.station.gate import HUNG_MAX, Gate
 from flasher.station.records.errors import RecordError
-from flasher.station.records.model import Admission, Answer, Elsewhere, ElsewhereState, Order
+from flasher.station.records.model import (
+    Admission,
+    Answer,
+    Elsewhere,
+    ElsewhereState,
+    Order,
+    RunId,
+)
 from tests.station.factory import FakeClock
 
 ORDER = Order("W2605002", "A", "jo")
@@ -22,6 +29,7 @@ class _Claims:
         self.answer: Elsewhere | RecordError | None = None
         self.asked: list[str] = []
         self.released: list[str] = []
+        self.runs_released: set[RunId] = set()
 
     def claim(self, token: str, order: Order, part: str) -> Elsewhere | None:
         self.asked.append(token)
@@ -37,6 +45,10 @@ class _Claims:
 
     def dropped(self, token: str) -> None:
         self.released.append(token)
+
+    def take_released(self) -> set[RunId]:
+        found, self.runs_released = self.runs_released, set()
+        return found
 
     def close(self) -> None:
         pass

@@ -7,11 +7,21 @@ from dataclasses import replace
 
 import pytest
 
+from flasher.cli.station.records import certificate
+from flasher.station.certificate_check import check_certificate
 from flasher.station.events import OperatorPrompted, RunEnded, ScanRefused, SocketState
 from flasher.station.gate import Gate
 from flasher.station.recipe_offers import Offers
 from flasher.station.records.errors import Refusal
-from flasher.station.records.model import Answer, Elsewhere, ElsewhereState, RunState, StepState
+from flasher.station.records.model import (
+    RELEASED_MARK,
+    Answer,
+    AuditEvent,
+    Elsewhere,
+    ElsewhereState,
+    RunState,
+    StepState,
+)
 from tests.station.factory import SERIAL, USUAL, Bench
 from tests.station.line_bench import LineBench
 from tests.station.test_gate import _Claims, _Question
@@ -85,6 +95,29 @@ def test_without_an_answer_the_pass_is_marked_everywhere(plant: Plant) -> None:
     assert details.run.duplicates == "not checked: no answer within 3 s"
     assert details.steps[0].state is StepState.SKIPPED
     assert plant.line.bench.store.examine().problems == ()
+
+
+def test_a_run_whose_claim_the_plant_released_is_marked_in_the_records(plant: Plant) -> None:
+    plant.scan()
+    plant.answer()
+    plant.line.work("A")
+    plant.line.end("A")
+    store, run_id = plant.line.bench.store, plant.line.last(RunEnded).run_id
+    life = store.read.unit(SERIAL)
+    before = certificate(store, life)
+    assert not check_certificate(store, before).problems
+    for _ in range(2):
+        plant.claims.runs_released = {run_id}
+        plant.line.turn()
+    assert len(store.read.noted("line-2", AuditEvent.CLAIM_RELEASED)) == 1
+    assert store.read.table()[0].duplicates == RELEASED_MARK
+    assert store.examine().problems == ()
+    assert "not checked whether it has passed at another station" not in before.decode()
+    made = certificate(store, life)
+    assert "not checked whether it has passed at another station" in made.decode()
+    assert not check_certificate(store, made).problems
+    (problem,) = check_certificate(store, before).problems
+    assert "may have passed at another station" in problem
 
 
 def test_a_unit_that_runs_elsewhere_is_refused_by_name(plant: Plant) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -28,6 +28,7 @@ from flasher.station.records.capability import VALUES_MIN, Basis, Capability
 from flasher.station.records.errors import NotFoundError, UnprovenError
 from flasher.station.records.model import (
     CHECKED,
+    RELEASED_MARK,
     TORN_TRACE,
     TRACE,
     AttachmentFile,
@@ -193,11 +194,24 @@ def unit(
                     story = explained(store.files, file)
                     stories.setdefault(details.run.run_id, []).append(story)
                     traces.append(_trace_document(details.run.run_id, file, story, full=full))
-        output.results(unit_lines(life, stories, full=full))
+        shown = _with_marks(life, store.read.released())
+        output.results(unit_lines(shown, stories, full=full))
         if page is not None:
             write_whole(page, certificate(store, life), "--certificate")
             output.progress(f"page: {printable(str(page))}")
-        return output.document(UnitDocument(unit=life, traces=traces))
+        return output.document(UnitDocument(unit=shown, traces=traces))
+
+
+def _with_marks(life: UnitLife, released: Collection[int]) -> UnitLife:
+    return replace(
+        life,
+        runs=tuple(
+            replace(each, run=replace(each.run, duplicates=RELEASED_MARK))
+            if each.run.run_id in released
+            else each
+            for each in life.runs
+        ),
+    )
 
 
 def _trace_document(
@@ -290,6 +304,8 @@ def _run_lines(details: RunDetails) -> Iterator[str]:
     yield f"run {run.run_id}, {utc_time(run.begun_at)}, {kind}: {run.state.value}{code}{took}"
     if run.text:
         yield f"  {printable(run.text)}"
+    if run.is_unchecked:
+        yield f"  twice?    duplicates {printable(run.duplicates or '')}"
     if run.reason:
         yield f"  reason:   {printable(run.reason)}"
     where = f"{run.station}, socket {run.socket}, operator {run.operator}"

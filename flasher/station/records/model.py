@@ -95,6 +95,8 @@ class AuditEvent(StrEnum):
     """A socket uses another recipe than before."""
     RELEASED = "released"
     """A golden unit passed with this version of flasher and this recipe."""
+    CLAIM_RELEASED = "claim released"
+    """The plant had released the claim of a unit before the end of its run arrived there."""
     REFUSED_SCAN = "refused scan"
     SIGN_IN = "sign-in"
     """A person signed in on a page."""
@@ -170,6 +172,9 @@ DUPLICATES: Final = "duplicates"
 """Measurement of the step `plant`: `CHECKED`, or "not checked: " and why it is not known whether
 the unit has passed at another station."""
 CHECKED: Final = "checked"
+RELEASED_MARK: Final = f"not {CHECKED}: its claim was released"
+"""Instead of that measurement, for a run that reached the plant after the claim of its unit was
+released; as `ReportedRun.duplicates`."""
 PLANT_CLAIM: Final = "plant claim"
 """Measurement of the step `plant`: the claim of the unit in the plant's database."""
 PLANT_ANSWER: Final = "plant answer"

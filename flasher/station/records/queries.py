@@ -19,6 +19,7 @@ from flasher.station.records.filters import JUDGED, counting, filtered
 from flasher.station.records.heads import ChainHead
 from flasher.station.records.model import (
     DUPLICATES,
+    RELEASED_MARK,
     SIGNATURE,
     AuditEvent,
     Figures,
@@ -68,13 +69,28 @@ class Records:
     def table(self, chosen: RunFilter = _EVERYTHING) -> list[ReportedRun]:
         """The runs of a filter, for reports."""
         query = filtered(run_query(VERIFIED), chosen).order_by(schema.run.c.id)
+        marks = dict.fromkeys(self.released(), RELEASED_MARK)
         with self._database.reading() as connection:
             return [
                 ReportedRun(
-                    **{**row, "kind": RunKind(row["kind"]), "state": RunState(row["state"])}
+                    **{
+                        **row,
+                        "kind": RunKind(row["kind"]),
+                        "state": RunState(row["state"]),
+                        "duplicates": marks.get(row["run_id"], row["duplicates"]),
+                    }
                 )
                 for row in connection.execute(query).mappings()
             ]
+
+    def released(self) -> set[int]:
+        """Runs that reached the plant after the claim of their unit was released. What they
+        recorded themselves, which is signed, does not tell: `RELEASED_MARK` takes its place.
+        """
+        audit = schema.audit.c
+        query = select(audit.run_id).where(audit.event == AuditEvent.CLAIM_RELEASED.value)
+        with self._database.reading() as connection:
+            return set(connection.execute(query).scalars())
 
     def run(self, run_id: RunId) -> RunDetails:
         """A run with its parts. Raises NotFoundError."""
