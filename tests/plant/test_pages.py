@@ -5,11 +5,14 @@ from __future__ import annotations
 from contextlib import closing
 from datetime import UTC, datetime
 
+import pytest
+
 from flasher.cli.station.records import passed_twice_lines
 from flasher.plant.store import PlantStore
+from flasher.station.records import rollup
 from flasher.station.records.capability import Capability
 from flasher.station.records.model import Admission, Order, RunFilter
-from flasher.station.records.rollup import Rollup
+from flasher.station.records.rollup import Rollup, Units
 from flasher.web.query_processes import Question
 from flasher.web.supervisor import SupervisorPages
 from tests.plant.factory import READER, Plant, Sender
@@ -29,7 +32,7 @@ def page(pages: SupervisorPages, path: str, **fields: str) -> str:
 
 
 def test_daily_sums_take_in_the_runs_of_a_station_that_was_off_line(
-    plant: Plant, sender: Sender
+    plant: Plant, sender: Sender, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     late = plant.sender("line-3")
     late.bench.make(serial="W2605003")
@@ -43,12 +46,17 @@ def test_daily_sums_take_in_the_runs_of_a_station_that_was_off_line(
             pass
         with sums.rolled(RunFilter()) as found:
             assert found is not None
+            before = found.run
         assert store.read.figures().units == 1
         late.send()
         late.close()
+        monkeypatch.setattr(rollup, "_recreate", None)  # only what they touch is added
         assert store.read.figures().units == 2
         while sums.add(LATER):
             pass
+        with sums.rolled(RunFilter()) as found:
+            assert found is not None
+            assert (found.run, found.all_units()) == (before, Units(2, 2, 2))
         assert store.read.figures().units == 2
 
 

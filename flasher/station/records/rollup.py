@@ -1,7 +1,8 @@
 """Stores daily sums of runs, so that pages with figures need not read the runs of all years.
 
-The sums are in a file beside the attachments and cover runs up to `Rolled.run`. Later runs, and
-days that a period covers partly, are read from the records. The file is rebuilt if it does not fit
+The sums are in a file beside the attachments and cover runs up to `Rolled.run`, without those whose
+end arrived since then. These, later runs, and days that a period covers partly, are read from the
+records. The file is rebuilt if it does not fit
 the records; nothing that is signed or verified depends on it, and it may be deleted.
 """
 
@@ -18,10 +19,11 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import datetime, time, timedelta
+from functools import partial
 from itertools import groupby
 from typing import Any, Final, NamedTuple
 
-from sqlalchemy import Connection, case, func, select
+from sqlalchemy import Connection, and_, case, func, not_, or_, select
 from sqlalchemy.sql.expression import ColumnElement
 
 from flasher.protocol.text import printable
@@ -105,6 +107,7 @@ class Day(NamedTuple):
 
 StepTimes = dict[str, Counter[float]]
 """Number of each duration in seconds, by step name."""
+_Chosen = Callable[[ColumnElement[int]], ColumnElement[bool]]
 _Times = dict[str, Counter[str]]
 """Number of each duration, as text for JSON, by step name."""
 _ALL: Final = (0, 0)
@@ -192,16 +195,19 @@ class Rollup:
             sums.execute("PRAGMA synchronous = NORMAL")
             sums.execute("BEGIN IMMEDIATE")
             with self._database.reading() as connection:
-                begun = _last_added(sums, connection)
-                if begun is None:
+                added = _added(sums, connection)
+                if added is None:
                     _recreate(sums)
-                    begun = 0
-                last, has_more = _last_to_add(connection, begun, now)
-                if last > begun:
-                    _Addition(sums, connection, begun, last).add()
-                    sums.execute("DELETE FROM state")
-                    content = json.dumps(_state(connection, last))
-                    sums.execute("INSERT INTO state VALUES (?)", (content,))
+                    added = _NOTHING
+                if added.late:
+                    has_more, until = True, added.late[-1].audit
+                    _Addition(sums, connection, added, partial(added.is_late, until=until)).add()
+                    _save_state(sums, connection, added.run, until)
+                else:
+                    last, has_more = _last_to_add(connection, added.run, now)
+                    if last > added.run:
+                        _Addition(sums, connection, added, _between(added.run, last)).add()
+                        _save_state(sums, connection, last)
             sums.execute("COMMIT")
         return has_more
 
@@ -246,42 +252,83 @@ class Rollup:
 def _rolled(sums: sqlite3.Connection, connection: Connection, chosen: RunFilter) -> Rolled | None:
     try:
         sums.execute("BEGIN")
-        run = _last_added(sums, connection)
+        added = _added(sums, connection)
         days = _Days(Day(*row) for row in sums.execute("SELECT * FROM day"))
     except sqlite3.Error:  # not whole, or not for this user: the records themselves are read
         return None
-    if not run:
+    if added is None or not added.run or len(added.late) >= _RUNS_AT_ONCE:
         return None
     allowed: dict[str, set[int]] = {}
     for column, query in named_in(chosen):
         found = set(connection.execute(query).scalars())
         allowed[column.name] = allowed.get(column.name, found) & found
     return Rolled(
-        sums, connection, chosen, run, days, allowed.get("recipe_id"), allowed.get("socket_id")
+        sums, connection, chosen, added, days, allowed.get("recipe_id"), allowed.get("socket_id")
     )
 
 
-def _state(connection: Connection, run: int) -> dict[str, Any]:
-    """Identifies the records and the last added run. The newest audit row differs in a restored
-    copy of the records that continued from there.
+class _Late(NamedTuple):
+    """A run of which the end arrived after later runs were added, as from a station that was off
+    line, and the audit row with that end.
+    """
+
+    audit: int
+    run: int
+
+
+class _Added(NamedTuple):
+    """What the sums hold: the runs up to `run`, without those in `late`."""
+
+    run: int
+    late: tuple[_Late, ...]
+    """In the order in which they arrived, the first `_RUNS_AT_ONCE`."""
+
+    def is_late(self, run_id: ColumnElement[int], until: int | None = None) -> ColumnElement[bool]:
+        """Condition of the late runs, of which there are some; up to the audit row `until`."""
+        audit = schema.audit.c
+        ends = select(audit.run_id).where(
+            audit.id >= self.late[0].audit, audit.event.in_(ENDINGS), audit.run_id <= self.run
+        )
+        return run_id.in_(ends if until is None else ends.where(audit.id <= until))
+
+    def holds(self, run_id: ColumnElement[int]) -> ColumnElement[bool]:
+        """Condition of runs that are in the sums."""
+        is_before = run_id <= self.run
+        return and_(is_before, not_(self.is_late(run_id))) if self.late else is_before
+
+
+_NOTHING: Final = _Added(0, ())
+
+
+def _between(begun: int, last: int) -> _Chosen:
+    return lambda run_id: and_(run_id > begun, run_id <= last)
+
+
+def _save_state(
+    sums: sqlite3.Connection, connection: Connection, run: int, until: int | None = None
+) -> None:
+    """Identify the records, the last added run, and the newest audit row; `until` limits these. The
+    row differs in a restored copy of the records that continued from there.
     """
     audit = schema.audit.c
     newest = select(audit.id, audit.hash).order_by(audit.id.desc()).limit(1)
-    row = connection.execute(newest).one()
+    row = connection.execute(newest if until is None else newest.where(audit.id <= until)).one()
     records = connection.execute(select(schema.schema_info.c.records_id)).scalar_one()
-    return {
+    state = {
         "layout": _LAYOUT, "records": records, "run": run, "audit": row.id, "hash": row.hash,
         "first": connection.execute(_FIRST).scalar_one(),
     }  # fmt: skip
+    sums.execute("DELETE FROM state")
+    sums.execute("INSERT INTO state VALUES (?)", (json.dumps(state),))
 
 
-def _last_added(sums: sqlite3.Connection, connection: Connection) -> int | None:
-    """Id of the last added run; None if the sums belong to other records."""
+def _added(sums: sqlite3.Connection, connection: Connection) -> _Added | None:
+    """What the sums hold; None if they belong to other records."""
     if not sums.execute("SELECT 1 FROM sqlite_master WHERE name = 'state'").fetchone():
         return None
     row = sums.execute("SELECT content FROM state").fetchone()
     if row is None:
-        return 0
+        return _NOTHING
     found = json.loads(row[0])
     if found["layout"] != _LAYOUT or found["first"] != connection.execute(_FIRST).scalar_one():
         return None
@@ -290,13 +337,11 @@ def _last_added(sums: sqlite3.Connection, connection: Connection) -> int | None:
     records = select(info.records_id).where(info.records_id == found["records"])
     if any(connection.execute(query).first() is None for query in (is_same, records)):
         return None
-    # A station of a plant may send runs of days that were added before.
-    late = select(audit.id).where(
+    late = select(audit.id, audit.run_id).where(
         audit.id > found["audit"], audit.event.in_(ENDINGS), audit.run_id <= found["run"]
     )
-    if connection.execute(late.limit(1)).first() is not None:
-        return None
-    return int(found["run"])
+    rows = connection.execute(late.order_by(audit.id).limit(_RUNS_AT_ONCE)).all()
+    return _Added(int(found["run"]), tuple(_Late(*row) for row in rows))
 
 
 def _recreate(sums: sqlite3.Connection) -> None:
@@ -333,13 +378,13 @@ def _last_to_add(connection: Connection, begun: int, now: datetime) -> tuple[int
 
 
 class _Addition:
-    """Adds runs after `first`, up to `last`."""
+    """Adds runs to the sums; `chosen` makes the condition of their ids."""
 
     def __init__(
-        self, sums: sqlite3.Connection, connection: Connection, first: int, last: int
+        self, sums: sqlite3.Connection, connection: Connection, added: _Added, chosen: _Chosen
     ) -> None:
         self._sums, self._connection = sums, connection
-        self._first, self._last = first, last
+        self._added, self._chosen = added, chosen
         self._days = _Days(Day(*row) for row in sums.execute("SELECT * FROM day"))
 
     def add(self) -> None:
@@ -350,7 +395,7 @@ class _Addition:
                 run.begun_at, run.is_virtual,
                 (run.ended_monotonic_s - run.begun_monotonic_s).label("duration_s"),
             )
-            .where(run.id > self._first, run.id <= self._last)
+            .where(self._chosen(run.id))
             .where(beside_index(run.kind) != RunKind.GOLDEN.value)
             .order_by(run.id)
         )  # fmt: skip
@@ -375,18 +420,19 @@ class _Addition:
         self._add_times({row.id: row for row in runs})
 
     def _add_histories(self, runs: Iterable[Any]) -> None:
-        added: dict[int, list[Judged]] = defaultdict(list)
+        added: dict[int, dict[int, Judged]] = defaultdict(dict)
         for row in runs:
             if row.state in JUDGED:
-                added[row.unit_id].append(self._days.judged(row))
-        before: dict[int, list[Judged]] = defaultdict(list)
-        for row in _judged_runs(self._connection, added, schema.run.c.id <= self._first):
-            before[row.unit_id].append(self._days.judged(row))
+                added[row.unit_id][row.id] = self._days.judged(row)
+        before: dict[int, dict[int, Judged]] = defaultdict(dict)
+        for row in _judged_runs(self._connection, added, self._added.holds(schema.run.c.id)):
+            before[row.unit_id][row.id] = self._days.judged(row)
         change: Counter[History] = Counter()
         for unit_id, more in added.items():
             if unit_id in before:
-                change[tuple(before[unit_id])] -= 1
-            change[(*before[unit_id], *more)] += 1
+                change[tuple(before[unit_id].values())] -= 1
+            every = before[unit_id] | more
+            change[tuple(every[run_id] for run_id in sorted(every))] += 1
         self._sums.executemany(
             "INSERT INTO history VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT DO UPDATE"
             " SET units = units + excluded.units",
@@ -419,8 +465,7 @@ class _Addition:
     def _add_times(self, runs: Mapping[int, Any]) -> None:
         step = schema.step.c
         query = select(step.run_id, step.name, rounded_s()).where(
-            step.run_id > self._first,
-            step.run_id <= self._last,
+            self._chosen(step.run_id),
             step.state == StepState.PASS.value,
         )
         days = {run_id: self._days.of(row.begun_at) for run_id, row in runs.items()}
@@ -523,12 +568,12 @@ def _merge(into: _Times, times: Mapping[str, Mapping[str, int]]) -> None:
 
 @dataclass(frozen=True)
 class Rolled:
-    """The sums for a filter, up to the run with the id `run`."""
+    """The sums for a filter."""
 
     _sums: sqlite3.Connection
     _connection: Connection
     chosen: RunFilter
-    run: int
+    _added: _Added
     _days: _Days
     _recipes: set[int] | None
     """Recipe ids that the filter allows; None: all."""
@@ -556,16 +601,25 @@ class Rolled:
         ]
 
     @property
+    def run(self) -> int:
+        """Id of the last run in the sums."""
+        return self._added.run
+
+    @property
     def tail(self) -> Rest:
         """Runs that were added to the records later."""
+        run_id = schema.run.c.id
+        later = run_id > self.run
+        if self._added.late:
+            later = or_(later, self._added.is_late(run_id))
         within = begun_in(self.chosen, beside_index(schema.run.c.begun_at))
         chosen = replace(self.chosen, since=None, until=None)
-        return Rest(chosen, [schema.run.c.id > self.run, *within])
+        return Rest(chosen, [later, *within])
 
     def _cut(self, whole: Collection[Day]) -> Iterator[Rest]:
         """Runs of days that lie only partly in the period or in a span."""
         kept = {day.number for day in whole}
-        condition = beside_index(schema.run.c.id) <= self.run
+        condition = self._added.holds(beside_index(schema.run.c.id))
         for day in self._days:
             if day.number in kept or day.end <= self._since or day.begin >= self._until:
                 continue
@@ -663,13 +717,14 @@ class Rolled:
         # The history of units with further runs is read from the records.
         apart = {unit for rest in (self.tail, *self._cut(whole)) for unit in self._judged(rest)}
         counted_apart: Counter[History] = Counter()
+        late = {each.run for each in self._added.late}
         for _, runs in groupby(
             _judged_runs(self._connection, sorted(apart)), key=lambda row: row.unit_id
         ):
             history: list[Judged] = []
             placed: list[Judged] = []
             for row in runs:
-                if row.id <= self.run:
+                if row.id <= self.run and row.id not in late:
                     history.append(self._days.judged(row))
                 passed = int(row.state == RunState.PASS.value)
                 placed.append(Judged(place_of(row.begun_at), row.recipe_id, row.socket_id, passed))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 import sqlite3
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import insert, select, text
+from sqlalchemy import Connection, insert, select, text
 
 from flasher.station.records import rollup, schema
+from flasher.station.records.chain import FINISHED
 from flasher.station.records.database import Database, locate
 from flasher.station.records.errors import RecordError
 from flasher.station.records.model import RunFilter, RunKind, RunState, utc_text
@@ -45,6 +46,10 @@ class Lines:
 
     def add(self, count: int) -> None:
         """Add runs of any order in time, past the rules of the database."""
+        self.add_numbers(range(self.runs + 1, self.runs + 1 + count))
+
+    def add_numbers(self, numbers: Sequence[int], *, arrive: bool = False) -> None:
+        """`arrive`: with the audit rows of their ends, in an order of their own."""
         with self.database.engine.connect() as connection:
             is_server = connection.dialect.name == "postgresql"
             if is_server:
@@ -56,12 +61,24 @@ class Lines:
             like = dict(
                 connection.execute(select(schema.run).where(schema.run.c.id == 1)).mappings().one()
             )
-            for number in range(self.runs + 1, self.runs + 1 + count):
+            for number in numbers:
                 self._add(connection, like, number)
+            for number in self.chance.sample(numbers, len(numbers) * arrive):
+                self._add_end(connection, number)
             for _, statement in rules if not is_server else ():
                 connection.exec_driver_sql(statement)
             connection.commit()
-        self.runs += count
+        self.runs = max(self.runs, *numbers)
+
+    @staticmethod
+    def _add_end(connection: Connection, run_id: int) -> None:
+        """Only what the sums read of it is right."""
+        audit = schema.audit
+        last = connection.execute(select(audit).order_by(audit.c.id.desc()).limit(1)).mappings()
+        values = {name: value for name, value in last.one().items() if name != "id"}
+        facts = {"event": FINISHED, "run_id": run_id, "number": values["number"] + 1}
+        hashes = {"previous_hash": values["hash"], "hash": f"{run_id:064x}"}
+        connection.execute(insert(audit).values(**values | facts | hashes))
 
     @staticmethod
     def _rules(connection: Any) -> list[tuple[str, str]]:
@@ -240,6 +257,31 @@ def test_sums_and_records_give_the_same_figures(lines: Lines) -> None:
     check(lines)
     lines.add(20)
     check(lines)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lines", [("Europe/Berlin", "sqlite")], indirect=True)
+def test_runs_that_arrive_late_are_added_to_the_days_that_they_touch(
+    lines: Lines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    late = lines.chance.sample(range(2, 301), 60)
+    lines.add_numbers([number for number in range(2, 301) if number not in late])
+    add_up(lines)
+    lines.add_numbers(late[:50], arrive=True)
+    check(lines)
+    sums = Rollup(lines.database)
+    with monkeypatch.context() as patched:
+        patched.setattr(rollup, "_recreate", None)
+        patched.setattr(rollup, "_RUNS_AT_ONCE", 20)
+        for _ in range(2):
+            assert sums.add(NOW)
+            check(lines)
+        lines.add_numbers(late[50:], arrive=True)
+        add_up(lines)
+        with sums.rolled(RunFilter()) as rolled:
+            assert rolled is not None
+            assert not rolled._added.late
+        check(lines)
 
 
 @pytest.mark.slow
