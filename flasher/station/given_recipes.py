@@ -130,6 +130,8 @@ class RecipeFolder:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self._whole: dict[str, object] = {}
+        """State of the files of the bundles that were whole, by digest."""
 
     @classmethod
     def of(cls, files: Path, station: str) -> RecipeFolder:
@@ -187,12 +189,23 @@ class RecipeFolder:
                     shutil.rmtree(each, ignore_errors=True)
 
     def is_whole(self, digest: str) -> bool:
-        """True if a bundle is here, with the content that its digest states."""
+        """True if a bundle is here, with the content that its digest states. Its files are read
+        again if they have changed since; `load` reads them in any case.
+        """
         try:
-            self._checked(digest)
-        except FlasherError:
+            state = self._state(digest)
+            if self._whole.get(digest) != state:
+                self._checked(digest)
+                self._whole[digest] = state
+        except (FlasherError, OSError):
             return False
         return True
+
+    def _state(self, digest: str) -> object:
+        """Equal as long as nobody writes to the files of a bundle. Raises OSError."""
+        paths = sorted((self.folder / digest).rglob("*"))
+        stats = [(path, path.stat()) for path in paths]
+        return [(path, each.st_size, each.st_mtime_ns, each.st_ino) for path, each in stats]
 
     def load(self, digest: str, day: date) -> LoadedRecipe:
         """Load a recipe and check it as `flasher station check` does. Its digest covers each file
@@ -201,7 +214,12 @@ class RecipeFolder:
 
         Raises UsageError with all problems.
         """
-        bundle = self._checked(digest)
+        try:
+            bundle = self._checked(digest)
+        except UsageError:
+            with suppress(OSError):  # so that the process that fetches reads it again
+                (self.folder / digest / _MANIFEST).touch()
+            raise
         path = self.folder / digest / _FILES / bundle.recipe
         loaded = replace(load_checked(path, day, may_waive=False), digest=digest)
         if bundle_of(loaded).files.items() - bundle.files.items():

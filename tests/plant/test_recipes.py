@@ -24,6 +24,7 @@ from flasher.plant.fetcher import Fetcher
 from flasher.plant.recipes import events_of, publish, withdraw
 from flasher.plant.release_functions import PIECE_BYTES
 from flasher.plant.setup import PUBLISHERS, setup
+from flasher.station import given_recipes
 from flasher.station.given_recipes import Bundle, RecipeFolder, bundle_of
 from flasher.station.recipe_file import load_checked
 from flasher.station.records.errors import RecordError
@@ -258,6 +259,35 @@ def test_a_connection_lost_between_two_pieces_leaves_nothing_half(
     assert "the server ended" in given.fault
     assert centre.folder.digests() == ()
     assert centre.fetcher.fetch().new == (digest,)
+
+
+def test_a_copy_that_has_not_changed_is_read_once_by_each_process(
+    centre: Centre, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    digest = centre.publish(REVISION_5)
+    centre.fetcher.fetch()
+    with monkeypatch.context() as patched:
+        patched.setattr(given_recipes, "sha256_of", None)
+        with pytest.raises(TypeError):
+            centre.fetcher.fetch()
+    centre.fetcher.fetch()
+    with monkeypatch.context() as patched:
+        patched.setattr(given_recipes, "sha256_of", None)
+        assert centre.fetcher.fetch().new == ()
+    image = centre.folder.folder / digest / "files" / "bms.bin"
+    data = image.read_bytes()
+    image.write_bytes(data[::-1])
+    assert centre.fetcher.fetch().new == (digest,), "of the same size"
+    assert image.read_bytes() == data
+    assert centre.fetcher.fetch().new == ()
+    before = image.stat()
+    image.write_bytes(data[::-1])
+    os.utime(image, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert not RecipeFolder(centre.folder.folder).is_whole(digest), "a new process reads it"
+    assert centre.fetcher.fetch().new == ()
+    with pytest.raises(UsageError, match="copy of a recipe from the plant is damaged"):
+        RecipeFolder(centre.folder.folder).load(digest, DAY)
+    assert centre.fetcher.fetch().new == (digest,), "which a socket could not use"
 
 
 def test_a_damaged_copy_is_fetched_again(centre: Centre) -> None:
