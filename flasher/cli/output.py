@@ -82,6 +82,8 @@ class Output:
         self.write_stderr: Callable[[str], None] = _plain_stderr
         """Writes a text to stderr; replaced while a progress bar is on the screen."""
         self._is_stdout_lost = False
+        self._has_begun = False
+        """True after `begin_document`, until `document`."""
         # A lost terminal no longer reports that it is one.
         self._terminals = [each for each in (sys.stdout, sys.stderr) if each.isatty()]
 
@@ -159,13 +161,32 @@ class Output:
             self.line({**as_json(around), **known, **failed})
         return exit_code
 
+    def begin_document(self, document: object, name: str, rows: Iterable[object]) -> None:
+        """Begin the JSON document with what is known and the rows of its last list, which are too
+        many to keep; silent without --json. The method `document` ends it, also after an error.
+        """
+        if not self.json_wanted:
+            return
+        self._has_begun = True
+        known = {key: value for key, value in as_json(document).items() if key != name}
+        self._write(f'{json.dumps(known)[:-1]}, "{name}": [')
+        try:
+            for number, row in enumerate(rows):
+                self._write(f"{', ' if number else ''}{json.dumps(as_json(row))}")
+        finally:
+            self._write("], ")
+
     def line(self, line: object) -> None:
         """Print a JSON line before the document; silent without --json. It has the key `event`."""
         if self.json_wanted:
             fields = line if isinstance(line, Mapping) else as_json(line)
             text = json.dumps({"schema": SCHEMA_VERSION, **fields})
             _LOG.debug("%s", text, extra=PRINTED)
-            self._print(text)
+            self._print(text[1:] if self._has_begun else text)
+            self._has_begun = False
+
+    def _write(self, part: str) -> None:
+        self._to_stdout(lambda: sys.stdout.write(part), "")
 
     def _print(self, text: str) -> None:
         self._to_stdout(lambda: print(text), text)

@@ -24,6 +24,8 @@ from flasher.errors import ExitCode
 from flasher.plant.process import Sending, sending
 from flasher.plant.schema import PLANT_SCHEMA
 from flasher.protocol.spec import BMS
+from flasher.station.records.errors import RecordError
+from flasher.station.records.overview import Overview
 from tests.cli.conftest import Flasher
 from tests.cli.station_threads import ThreadPort
 from tests.cli.test_schema import hold_output
@@ -346,6 +348,44 @@ def test_what_reads_all_stations(flasher: Flasher, plant: Plant, sender: Sender)
     assert changed.out.startswith("line-2, run 1: what reports and pages show differs")
     none = flasher("plant", "units", "--image", "V9", *database)
     assert "No station has used an image V9" in none.err
+
+
+@pytest.mark.parametrize("words", [(), ("--json",)])
+def test_units_are_printed_while_they_are_read(
+    flasher: Flasher,
+    plant: Plant,
+    sender: Sender,
+    monkeypatch: pytest.MonkeyPatch,
+    words: tuple[str, ...],
+) -> None:
+    """The server is lost after two of three pages."""
+    for number in range(3):
+        sender.bench.make(serial=f"W260500{number}")
+    sender.send()
+    command = ("plant", "units", "--image", BMS_SHA256, "--database", plant.url("flasher_desk"))
+    monkeypatch.setattr("flasher.cli.plant.reading._AT_ONCE", 1)
+    schema = json.loads(SCHEMA.read_text("utf-8"))
+    whole = flasher(*command, *words)
+    if words:
+        hold_output(schema, whole.out, whole.code)
+        assert len(json.loads(whole.out)["units"]) == 3
+    holders, calls = Overview.holders, iter((1, 2))
+
+    def lost(*asked: Any) -> Any:
+        if next(calls, None) is None:
+            raise RecordError("The plant's database cannot be read: the server ended.")
+        return holders(*asked)
+
+    monkeypatch.setattr(Overview, "holders", lost)
+    cut = flasher(*command, *words)
+    assert cut.code == ExitCode.USAGE
+    if words:
+        hold_output(schema, cut.out, cut.code)
+        document = json.loads(cut.out)
+        assert [each["serial"] for each in document["units"]] == ["W2605002", "W2605001"]
+        assert document["error"]["what"].endswith("the server ended.")
+    else:
+        assert cut.out.splitlines() == whole.out.splitlines()[:3]
 
 
 def test_a_process_that_is_killed_is_replaced(plant: Plant, sender: Sender) -> None:

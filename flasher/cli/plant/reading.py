@@ -79,13 +79,16 @@ def units(output: Output, url: str, wanted: str) -> int:
                 remedy="Give its SHA-256, the beginning of it, or the whole version;"
                 " flasher image-info IMAGE shows both.",
             )
-        found = [
+        found = (
             unit
             for sha256 in dict.fromkeys(each.sha256 for each in images)
             for unit in _holders(overview, sha256)
-        ]
-    output.results(printable(line) for line in _unit_lines(images, found))
-    return output.document(PlantUnitsDocument(images, found))
+        )
+        # Hundreds of thousands: they are printed as they come.
+        output.begin_document(PlantUnitsDocument(images, []), "units", found)
+        if not output.json_wanted:
+            output.results(printable(line) for line in _unit_lines(images, found))
+    return output.document(None)
 
 
 def _holders(overview: Overview, sha256: str) -> Iterator[InstalledUnit]:
@@ -96,15 +99,16 @@ def _holders(overview: Overview, sha256: str) -> Iterator[InstalledUnit]:
         cursor = page.older
 
 
-def _unit_lines(images: list[ImageRecord], found: list[InstalledUnit]) -> Iterator[str]:
+def _unit_lines(images: list[ImageRecord], found: Iterator[InstalledUnit]) -> Iterator[str]:
+    count = 0
     for image in images:
         yield f"{image.target} {image.name}, version {image.version or 'unknown'}, {image.sha256}"
-    for unit in found:
+    for count, unit in enumerate(found, 1):  # noqa: B007
         sure = "" if unit.is_confirmed else ", NOT CONFIRMED: it may hold a part of it, or none"
         nature = ", VIRTUAL" if unit.is_virtual else ""
         state, day = unit.state.value, f"{unit.begun_at:%Y-%m-%d}"
         yield f"  {unit.serial}, part {unit.part}: {unit.target}, {day}, {state}{sure}{nature}"
-    yield counted(len(found), "unit")
+    yield counted(count, "unit")
 
 
 # -- all runs --------------------------------------------------------------------------------------
