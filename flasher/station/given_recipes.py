@@ -16,12 +16,12 @@ import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from datetime import date
+from datetime import date, datetime
 from pathlib import Path
 from secrets import token_hex
-from typing import Final
+from typing import Annotated, Final
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import AfterValidator, TypeAdapter, ValidationError
 
 from flasher.errors import ErrorCode, FlasherError, UsageError
 from flasher.files import is_plain, read
@@ -98,6 +98,15 @@ def parse_bundle(manifest: str, digest: str) -> Bundle:
 # -- what the plant gives --------------------------------------------------------------------------
 
 
+def _moment(at: str) -> str:
+    """Check a time, which pages show in their own time zone. Raises ValueError."""
+    try:
+        datetime.fromisoformat(at).astimezone()
+    except OverflowError as error:
+        raise ValueError(str(error)) from error
+    return at
+
+
 @dataclass(frozen=True)
 class GivenRecipe:
     """A recipe that the plant gives to this station."""
@@ -105,7 +114,7 @@ class GivenRecipe:
     digest: str
     sockets: tuple[str, ...]
     """Sockets that it is for."""
-    at: str
+    at: Annotated[str, AfterValidator(_moment)]
     """Time of its publication, by the database's clock."""
     by: str
     """User of the database who published it."""

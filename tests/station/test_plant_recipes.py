@@ -476,3 +476,11 @@ def test_a_manifest_names_files_of_its_folder_only(plant: Plant, name: str) -> N
     )
     with pytest.raises(ValueError, match=r"its|outside|no name|two of"):
         parse_bundle(bundle.to_text(), bundle.digest)
+
+
+@pytest.mark.parametrize("at", ["", "yesterday", "0001-01-01T00:00:00+14:00"])
+def test_a_list_with_a_time_that_pages_cannot_show_is_refused(tmp_path: Path, at: str) -> None:
+    folder = RecipeFolder(tmp_path)
+    folder.save_given(Given((GivenRecipe("0" * 64, ("A",), at, "anna"),)))
+    with pytest.raises(RecordError, match="list of recipes from the plant cannot be read"):
+        folder.given()
