@@ -208,11 +208,18 @@ def is_regular(path: str | os.PathLike[str]) -> bool:
     return stat.S_ISREG(_mode(path))
 
 
-def is_open_to_all(path: str | os.PathLike[str]) -> bool:
-    """True for a file that every user of this computer may read or write. Raises UsageError for one
-    in a folder that may not be entered.
+def check_secret(path: str | os.PathLike[str], what: str) -> None:
+    """Check that not every user of this computer may read or write a file that holds `what`. A
+    group may: that of a service shares its files so, and systemd its credentials. Raises
+    UsageError.
     """
-    return os.name == "posix" and bool(_mode(path) & stat.S_IRWXO)
+    if os.name == "posix" and _mode(path) & stat.S_IRWXO:
+        raise UsageError(
+            f"Every user of this computer may read {what}, or change it.",
+            where=printable(os.fspath(path)),
+            remedy="Let the user of this program, or its group, alone read it:"
+            f" chmod o= {printable(shlex.quote(os.fspath(path)))}",
+        )
 
 
 def _mode(path: str | os.PathLike[str]) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Final, Literal
@@ -11,7 +10,7 @@ from urllib.parse import SplitResult, unquote, urlsplit
 from pydantic import Field, StringConstraints, field_validator, model_validator
 
 from flasher.errors import UsageError
-from flasher.files import is_open_to_all, read
+from flasher.files import check_secret, read
 from flasher.protocol.text import printable
 from flasher.settings.toml_reader import Reader, TomlTable
 
@@ -36,7 +35,7 @@ class Receiver(TomlTable):
     user: str = ""
     """User name."""
     password_file: str = ""
-    """File with the password, readable by the user of this program alone."""
+    """File with the password, which not every user of the computer may read."""
     ca_file: str = ""
     """File with the certificates (PEM) that vouch for the server; empty: those of the computer."""
     time_limit_s: float = Field(default=10.0, gt=0, le=60)
@@ -144,13 +143,7 @@ def password_of(receiver: Receiver) -> str | None:
     """Read the password; None without one. Raises UsageError."""
     if not receiver.password_file:
         return None
-    if is_open_to_all(receiver.password_file):
-        raise UsageError(
-            f"Every user of this computer may read the password of {receiver.name}, or change it.",
-            where=printable(receiver.password_file),
-            remedy="Let the user of this program alone read it:"
-            f" chmod 600 {printable(shlex.quote(receiver.password_file))}",
-        )
+    check_secret(receiver.password_file, f"the password of {receiver.name}")
     raw = read(receiver.password_file, _PASSWORD_MAX_SIZE, what="file with the password")
     try:
         password = raw.decode("utf-8").rstrip("\r\n")

@@ -55,6 +55,7 @@ def threads(monkeypatch: pytest.MonkeyPatch) -> None:
 def password(tmp_path: Path) -> Path:
     path = tmp_path / "password"
     path.write_text("long enough\n")
+    path.chmod(0o640)
     return path
 
 
@@ -165,7 +166,8 @@ def test_a_stopped_line_waits_for_the_people_at_its_page(
         (("--web", "0.0.0.0:0"), "to other computers without TLS"),
         (("--web", "0.0.0.0:0", "--web-insecure"), "without a password"),
         (("--web", "0", "--web-key", RECIPE), "are needed together"),
-        (("--web", "0", "--web-key", RECIPE, "--web-certificate", RECIPE), "cannot be used"),
+        (("--web", "0", "--web-key", RECIPE, "--web-certificate", RECIPE), "read the key of"),
+        (("--web", "0", "--web-password", RECIPE), "may read the password of the pages"),
         (("--web", "0", "--web-password", RECIPE.parent / "none"), "none"),
         (("--web", "70000"), "must be PORT"),
         (("--web", "203.0.113.7:0", "--web-insecure"), "without a password"),
@@ -181,12 +183,21 @@ def test_pages_that_others_could_read_are_refused(
 
 def test_a_short_password_is_refused(flasher: Flasher, tmp_path: Path) -> None:
     (tmp_path / "short").write_text("1234\n")
+    (tmp_path / "short").chmod(0o640)
     run = flasher(*RUN, "--units", "1", "--web", "0", "--web-password", tmp_path / "short")
     assert run.code == ExitCode.USAGE
     assert "fewer than 8 characters" in run.err
 
 
-def test_a_port_that_is_taken_is_said(flasher: Flasher) -> None:
+def test_a_key_that_is_none_is_refused(flasher: Flasher, tmp_path: Path) -> None:
+    key = tmp_path / "key"
+    key.touch(0o600)
+    run = flasher(*RUN, "--units", "1", "--web", "0", "--web-key", key, "--web-certificate", RECIPE)
+    assert run.code == ExitCode.USAGE
+    assert "cannot be used" in run.err
+
+
+def test_a_port_that_is_taken_is_reported(flasher: Flasher) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         run = flasher(*RUN, "--units", "1", "--web", other.getsockname()[1])
     assert run.code == ExitCode.USAGE

@@ -87,7 +87,7 @@ def test_a_file_without_a_password(tmp_path: Path, content: bytes) -> None:
 
 @pytest.mark.skipif(os.name != "posix", reason="its files have no mode")
 @pytest.mark.parametrize("mode", [0o604, 0o602, 0o666])
-def test_a_password_that_everybody_may_read_or_change_is_not_used(
+def test_a_password_that_every_user_may_read_or_change_is_not_used(
     tmp_path: Path, mode: int
 ) -> None:
     mes, _ = load_receivers(written(tmp_path, GOOD))
@@ -96,7 +96,7 @@ def test_a_password_that_everybody_may_read_or_change_is_not_used(
     file.chmod(mode)
     with pytest.raises(UsageError, match="Every user of this computer") as caught:
         password_of(mes)
-    assert caught.value.remedy.endswith(f"chmod 600 {file}")
+    assert caught.value.remedy.endswith(f"chmod o= {file}")
 
 
 def test_certificates_that_are_missing_or_none(tmp_path: Path) -> None:

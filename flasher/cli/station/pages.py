@@ -28,7 +28,7 @@ from flasher.cli.station.commands import Address, PagesOptions, RecordsOptions
 from flasher.cli.station.place import open_to_read
 from flasher.cli.stop import stop_on_signal
 from flasher.errors import ErrorCode, ExitCode, UsageError
-from flasher.files import read
+from flasher.files import check_secret, read
 from flasher.i18n import text
 from flasher.protocol.text import printable
 from flasher.station.board import Board
@@ -308,13 +308,17 @@ def _tls(options: PagesOptions) -> Tls | None:
             remedy="Give both.",
             code=ErrorCode.PAGES_NOT_SERVED,
         )
-    return None if certificate is None or key is None else Tls(certificate, key)
+    if certificate is None or key is None:
+        return None
+    check_secret(key, "the key of the pages")
+    return Tls(certificate, key)
 
 
 def _password(options: PagesOptions) -> str:
     path = options.web_password
     if path is None:
         return ""
+    check_secret(path, "the password of the pages")
     data = read(path, _PASSWORD_FILE_MAX_SIZE, what="file of the password")
     text = data.decode("utf-8", "replace").partition("\n")[0].strip()
     if len(text) < PASSWORD_MIN:
