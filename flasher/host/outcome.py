@@ -371,7 +371,13 @@ _TWO_PERHAPS_ERASED: Final = _Explanation(
 
 def image_refused(ending: Ending, target: Target, detail: str) -> FlasherError:
     """Create the error for an image that a check refuses where no device is concerned."""
-    return _EXPLANATIONS[ending].error(ending, target, detail)
+    explained = _EXPLANATIONS[ending]
+    if ending is Ending.NOT_FOR_DEVICE:
+        explained = explained._replace(
+            cause="another file or another target was meant, or the manifest is not up to date",
+            remedy="Name the target of the image with -t, or another file.",
+        )
+    return explained.error(ending, target, detail)
 
 
 def _late(phase: Phase, left: DeviceLeft) -> _Explanation:
