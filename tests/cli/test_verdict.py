@@ -19,6 +19,7 @@ from flasher.host.verify import Verdict as Verified
 from flasher.image.plan import plan
 from flasher.protocol.spec import TARGETS, WELLING
 from tests.host.bench import Bench
+from tests.loops import each
 
 from .conftest import SAMPLES, Flasher
 
@@ -102,6 +103,12 @@ def test_what_makes_the_last_line_long_stands_in_the_error_alone(
     run = flasher("flash", tmp_path / "noise.bin", "-t", "bms", *MOCK)
     assert run.err.splitlines()[-1] == "FAILED  BMS: not plausible as firmware"
     assert "--allow-implausible" in run.err
+
+
+@each("name", ("my. file.hex", ".", "none (1).hex"))
+def test_the_last_line_names_a_file_whole(flasher: Flasher, name: str) -> None:
+    run = flasher("flash", name, "-t", "bms", *MOCK)
+    assert run.err.splitlines()[-1].startswith(f"FAILED  {name} cannot be read")
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -215,14 +216,15 @@ def verdict_of(result: Result, checks: Iterable[CheckMade], took_s: float) -> Cl
 
 _LINE_MAX: Final = 120
 """Maximum number of characters: a longer text loses its remark in brackets."""
+_REMARK: Final = re.compile(r" \((?:[^()]|\([^()]*\))*\)(?![^\s:;,])")
 
 
 def failed(error: FlasherError, more: str = "") -> ClosingLine:
     """Return the last line of an upgrade that failed; the whole error is printed above it."""
     word = "STOPPED" if isinstance(error, InterruptedByUserError) else "FAILED"
-    what = error.what.partition(" (" if more else ". ")[0].removesuffix(".")
-    if len(what) > _LINE_MAX:
-        what = what.partition(" (")[0]
+    what = error.what.removesuffix(".")
+    if more or len(what) > _LINE_MAX:
+        what = _REMARK.sub("", what)
     if error.needs_rescue and not more:
         more = "; it may have no application now"
     return ClosingLine(word, what + more, "red")
