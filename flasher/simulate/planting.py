@@ -194,4 +194,5 @@ def _differ(one: CodeType, other: CodeType) -> bool:
 
 def _shape(code: CodeType) -> tuple[object, ...]:
     variables = code.co_varnames, code.co_freevars, code.co_cellvars
-    return code.co_code, code.co_names, code.co_exceptiontable, *variables
+    handlers = getattr(code, "co_exceptiontable", b"")  # PyPy has them in co_code
+    return code.co_code, code.co_names, handlers, *variables
