@@ -159,7 +159,10 @@ static int exchange_banks(const record_t *order)
         if (!is_blank((const uint8_t *)entry, sizeof entry))
             unit = at / UNIT_BYTES + 1;
     }
-    unit += unit || done; /* a write that was cut may look blank */
+    for (uint32_t at = 0; !unit && at < JOURNAL_BYTES; at += SECTOR_BYTES)
+        if (!erase(JOURNAL_AT + at)) /* its first write may have been cut, and look blank */
+            return 0;
+    unit += unit > 0; /* as the last one may */
     for (; done < 3 * SECTORS(order->size); done++) {
         uint32_t at = done / 3 * SECTOR_BYTES;
         uint32_t to[3] = {SCRATCH_AT, APPLICATION_AT + at, SECOND_AT + at};
