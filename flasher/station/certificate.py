@@ -5,8 +5,6 @@ The certificate of a unit that did not pass states that in its first line.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Final
 
@@ -64,34 +62,13 @@ RUN_WORDS: Final = {
 }
 
 
-@dataclass(frozen=True)
-class Proof:
-    """Evidence for the last run of a unit."""
-
-    head: ChainHead | None = None
-    """The signed audit row; None while the run is active."""
-    record_sha256: str = ""
-    """SHA-256 over the run with its steps, writes, targets and attachments."""
-    is_kept: bool = False
-    """The head of its audit row is stored in another place than the key's folder."""
-    is_beside: bool = False
-    """The head of its audit row is stored in the key's folder."""
-    examined_at: str = ""
-    """Time of the last examination of all records up to its audit row; "" without one."""
-    content: Mapping[str, Any] = field(default_factory=dict)
-    """Rows of the run, which the certificate contains."""
-    row: Mapping[str, Any] = field(default_factory=dict)
-    is_released: bool = False
-    """The plant released the claim of the unit before it had the end of the run."""
-    seal: str = ""
-    """Signed lines of an existing certificate; "" to make them."""
-
-
-def proven(store: Store, life: UnitLife) -> Proof:
-    """Examine the last run of a unit. Raises UnprovenError if its records were changed."""
+def proven(store: Store, life: UnitLife, made_at: datetime) -> Sealed | None:
+    """Examine the last run of a unit, and seal it; None while it is active. Raises UnprovenError if
+    its records were changed.
+    """
     last = life.runs[-1].run if life.runs else None
     if last is None or last.state is RunState.RUNNING:
-        return Proof()
+        return None
     found = store.examine_run(last.run_id)
     for problem in found.problems:
         raise UnprovenError(
@@ -102,41 +79,49 @@ def proven(store: Store, life: UnitLife) -> Proof:
             cause=text("{where}: {what}", where=problem.where, what=problem.what),
             remedy=text("List all problems with flasher station verify."),
         )
-    head, record_sha256 = store.read.head_of(last.run_id), store.read.record_sha256(last.run_id)
+    head = store.read.head_of(last.run_id)
+    if head is None:
+        return None
     content, row = store.read.content_of(last.run_id)
-    return Proof(
-        head,
-        record_sha256,
-        bool(found.elsewhere),
-        found.is_beside,
-        (found.examined_at or "")[:10],
-        content,
-        row,
-        last.run_id in store.read.released(),
+    earlier = [details.run for details in life.runs[:-1]]
+    return Sealed(
+        flasher=__version__,
+        made_at=made_at.isoformat(),
+        is_kept=bool(found.elsewhere),
+        is_beside=found.is_beside,
+        examined_at=(found.examined_at or "")[:10],
+        content={k: value for k, value in content.items() if k not in LEFT_OUT},
+        recipe={name: content["recipe"][name] for name in ("name", "revision", "sha256")},
+        row={name: row[name] for name in _ROW},
+        station=head.station,
+        signature=head.signature,
+        key=head.key,
+        earlier=tuple(map(plain, earlier[-EARLIER_SHOWN:])),
+        earlier_left_out=max(0, len(earlier) - EARLIER_SHOWN),
+        is_released=last.run_id in store.read.released(),
     )
 
 
 def render_certificate(
-    life: UnitLife, made_at: datetime, proof: Proof, left_out: int = 0, language: str = "en"
+    life: UnitLife, made_at: datetime, sealed: Sealed | None, language: str = "en"
 ) -> str:
-    """Render a certificate as HTML. `left_out`: number of earlier runs that are not in `life`.
-
-    Raises UsageError for a unit without runs.
-    """
-    return render_page("certificate.html", language, **sheet(life, made_at, proof, left_out))
+    """Render a certificate as HTML. Raises UsageError for a unit without runs."""
+    return render_page("certificate.html", language, **sheet(life, made_at, sealed))
 
 
-def sheet(life: UnitLife, made_at: datetime, proof: Proof, left_out: int = 0) -> dict[str, Any]:
+def sheet(life: UnitLife, made_at: datetime, sealed: Sealed | None) -> dict[str, Any]:
     """Values for the template certificate.html. Raises UsageError for a unit without runs."""
     last = life.last
     if last is None:
         raise UsageError(text("{serial} has no run to certify.", serial=life.serial))
     status, word, sentence = UNIT_WORDS[life.state]
-    is_unchecked = last.run.is_unchecked or proof.is_released
+    is_unchecked = last.run.is_unchecked or (sealed is not None and sealed.is_released)
     if life.is_virtual or is_unchecked:
         status = Status.WARNING  # never the colour of a product that passed
     earlier = life.runs[:-1]
+    left_out = max(0, len(earlier) - EARLIER_SHOWN)
     signatures = {target.signature for target in last.targets}
+    head = None if sealed is None else sealed.head
     return {
         "life": life,
         "last": last,
@@ -145,14 +130,11 @@ def sheet(life: UnitLife, made_at: datetime, proof: Proof, left_out: int = 0) ->
         "sentence": sentence,
         "is_virtual": life.is_virtual,
         "is_unchecked": is_unchecked,
-        "head": proof.head,
-        "key": fingerprint(proof.head.key) if proof.head else "",
-        "is_kept": proof.is_kept,
-        "is_beside": proof.is_beside,
-        "examined_at": proof.examined_at,
-        "seal": proof.seal or _seal(life, made_at, proof),
-        "record_sha256": proof.record_sha256,
-        "code": "" if proof.head is None else _code(last, proof.record_sha256, proof.head),
+        "sealed": sealed,
+        "head": head,
+        "key": fingerprint(head.key) if head else "",
+        "seal": as_text(sealed) if sealed else "",
+        "code": _code(last, sealed) if sealed else "",
         "writes": last.writes[:_WRITES_ON_SHEET],
         "text_limit": _TEXT_ON_SHEET,
         "has_more_writes": len(last.writes) > _WRITES_ON_SHEET
@@ -172,41 +154,16 @@ def sheet(life: UnitLife, made_at: datetime, proof: Proof, left_out: int = 0) ->
             (run, RUN_WORDS[run.state][1])
             for run in (details.run for details in earlier[-EARLIER_SHOWN:])
         ],
-        "earlier_left_out": max(0, len(earlier) - EARLIER_SHOWN) + left_out,
+        "earlier_left_out": sealed.earlier_left_out if sealed else left_out,
         "moment": _moment,
         "number": number,
         "made_at": _moment(made_at),
     }
 
 
-def _seal(life: UnitLife, made_at: datetime, proof: Proof) -> str:
-    if proof.head is None or not proof.row:
-        return ""
-    earlier = [details.run for details in life.runs[:-1]]
-    recipe = proof.content["recipe"]
-    return as_text(
-        Sealed(
-            flasher=__version__,
-            made_at=made_at.isoformat(),
-            is_kept=proof.is_kept,
-            is_beside=proof.is_beside,
-            examined_at=proof.examined_at,
-            content={k: value for k, value in proof.content.items() if k not in LEFT_OUT},
-            recipe={name: recipe[name] for name in ("name", "revision", "sha256")},
-            row={name: proof.row[name] for name in _ROW},
-            station=proof.head.station,
-            signature=proof.head.signature,
-            key=proof.head.key,
-            earlier=tuple(map(plain, earlier[-EARLIER_SHOWN:])),
-            earlier_left_out=max(0, len(earlier) - EARLIER_SHOWN),
-            is_released=proof.is_released,
-        )
-    )
-
-
-def _code(last: RunDetails, record_sha256: str, head: ChainHead) -> Markup:
+def _code(last: RunDetails, sealed: Sealed) -> Markup:
     """QR code with which a printed certificate can be compared with the records."""
-    lines = code_lines(last, record_sha256, head)
+    lines = code_lines(last, sealed.record_sha256, sealed.head)
     drawn = segno.make("\n".join(lines), error="m", micro=False, boost_error=False)
     return Markup(drawn.svg_inline(omitsize=True, svgclass=None, lineclass=None))  # noqa: S704
 

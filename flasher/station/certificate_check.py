@@ -20,12 +20,12 @@ from flasher import __version__
 from flasher.errors import UsageError
 from flasher.i18n import text
 from flasher.protocol.text import printable
-from flasher.station.certificate import EARLIER_SHOWN, Proof, code_lines, render_certificate
+from flasher.station.certificate import EARLIER_SHOWN, code_lines, render_certificate
 from flasher.station.records.errors import NotFoundError, UnprovenError
 from flasher.station.records.model import RunId
 from flasher.station.records.signatures import fingerprint, is_signed
 from flasher.station.records.store import Store
-from flasher.station.sealed import CheckedCertificate, Sealed, as_text, plain, sealed_in
+from flasher.station.sealed import CheckedCertificate, Sealed, plain, sealed_in
 from flasher.translation import NAMES
 
 _PDF: Final = b"%PDF-"
@@ -51,18 +51,8 @@ def check_certificate(store: Store, data: bytes) -> CheckedCertificate:
         problems = sealed.wrong()
         life = sealed.life()
         made_at = datetime.fromisoformat(sealed.made_at)
-        proof = Proof(
-            sealed.head,
-            sealed.record_sha256,
-            sealed.is_kept,
-            sealed.is_beside,
-            sealed.examined_at,
-            is_released=sealed.is_released,
-            seal=as_text(sealed),
-        )
-        left_out = sealed.earlier_left_out
         expected = [
-            render_certificate(life, made_at, proof, left_out, language)
+            render_certificate(life, made_at, sealed, language)
             for language in _languages(page_text)
         ]
         where = _difference_of_page(_closest(expected, page_text), data, pages)

@@ -48,9 +48,11 @@ class Sealed:
     made_at: str
     """Time at which the page was made (ISO 8601)."""
     is_kept: bool
+    """The head of its audit row is stored in another place than the key's folder."""
     is_beside: bool
+    """The head of its audit row is stored in the key's folder."""
     examined_at: str
-    """`is_kept`, `is_beside` and `examined_at`: see `certificate.Proof`."""
+    """Day of the last examination of all records up to its audit row; "" without one."""
     content: dict[str, Any]
     """The rows of the run and of everything that it refers to, by table."""
     recipe: dict[str, str]
@@ -65,7 +67,7 @@ class Sealed:
     earlier_left_out: int
     """Number of earlier runs that are not in `earlier`."""
     is_released: bool = False
-    """See `certificate.Proof`."""
+    """The plant released the claim of the unit before it had the end of the run."""
 
     @property
     def head(self) -> ChainHead:

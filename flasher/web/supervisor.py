@@ -275,15 +275,16 @@ class SupervisorPages:
     def certificate(self, question: Question) -> Answer:
         fields = question.fields
         life = self.store.read.unit(fields.get("serial", ""), fields.get("part"))
-        made = sheet(life, datetime.now(UTC), proven(self.store, life))
+        now = datetime.now(UTC)
+        made = sheet(life, now, proven(self.store, life, now))
         return self._page(question, "certificate.html", path="/units", **made)
 
     def file_of_certificate(self, question: Question) -> Answer:
         """Download of a certificate, to check it later."""
         fields = question.fields
         life = self.store.read.unit(fields.get("serial", ""), fields.get("part"))
-        proof = proven(self.store, life)
-        made = render_certificate(life, datetime.now(UTC), proof, language=question.language)
+        now = datetime.now(UTC)
+        made = render_certificate(life, now, proven(self.store, life, now), question.language)
         name = re.sub(r"[^\w.-]", "_", life.serial, flags=re.ASCII)
         return Answer(made.encode("utf-8"), file_name=f"{name}.html")
 

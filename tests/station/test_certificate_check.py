@@ -54,8 +54,8 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 
 def page(bench: Bench, serial: str = SERIAL, language: str = "en") -> str:
     life = bench.store.read.unit(serial)
-    proof = proven(bench.store, life)
-    return render_certificate(life, bench.clock.utc(), proof, language=language)
+    now = bench.clock.utc()
+    return render_certificate(life, now, proven(bench.store, life, now), language)
 
 
 def checked(bench: Bench, text: str) -> CheckedCertificate:

@@ -15,7 +15,7 @@ import segno
 
 from flasher.cli.documents import as_json
 from flasher.errors import UsageError
-from flasher.station.certificate import Proof, proven, render_certificate
+from flasher.station.certificate import proven, render_certificate
 from flasher.station.records.model import (
     Measurement,
     RunFilter,
@@ -64,7 +64,8 @@ def report(plant: Bench) -> Report:
 
 def page(bench: Bench, serial: str) -> str:
     life = bench.store.read.unit(serial)
-    return render_certificate(life, bench.clock.utc(), proven(bench.store, life))
+    now = bench.clock.utc()
+    return render_certificate(life, now, proven(bench.store, life, now))
 
 
 def test_a_report_s_rows_are_the_runs(plant: Bench, report: Report) -> None:
@@ -223,4 +224,4 @@ def test_earlier_runs_are_on_the_page(plant: Bench) -> None:
 def test_nothing_is_certified_for_a_unit_without_runs(plant: Bench, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
     with pytest.raises(UsageError, match="no run to certify"):
-        render_certificate(UnitLife("W1", "P", UnitState.NEW, ()), plant.clock.utc(), Proof())
+        render_certificate(UnitLife("W1", "P", UnitState.NEW, ()), plant.clock.utc(), None)

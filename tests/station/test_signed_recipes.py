@@ -232,7 +232,8 @@ def test_record_and_certificate_state_who_signed_or_what_was_waived(
     (target,) = life.last.targets
     assert target.signature is not None
     assert target.signature.startswith(sentence)
-    page = render_certificate(life, bench.clock.utc(), proven(bench.store, life))
+    now = bench.clock.utc()
+    page = render_certificate(life, now, proven(bench.store, life, now))
     assert sentence in page
     assert page.count(sentence) == 1
     assert check_certificate(bench.store, page.encode()).problems == ()

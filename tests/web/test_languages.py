@@ -378,11 +378,8 @@ def test_a_failed_run_in_the_records(
 def test_records_that_were_changed(tmp_path: Path, statement: str, shows: str) -> None:
     bench = Bench(Path(tempfile.mkdtemp(dir=tmp_path)))
     bench.make(RunState.PASS, SERIAL)
-    made = render_certificate(
-        bench.store.read.unit(SERIAL),
-        datetime.now(UTC),
-        proven(bench.store, bench.store.read.unit(SERIAL)),
-    )
+    life, now = bench.store.read.unit(SERIAL), datetime.now(UTC)
+    made = render_certificate(life, now, proven(bench.store, life, now))
     bench.store.close()
     forger = Forger(bench.path)
     if statement:

@@ -167,8 +167,8 @@ def certificate(store: Store, life: UnitLife) -> bytes:
     """Render the certificate of a unit. Raises UnprovenError if its records were changed."""
     from flasher.station.certificate import proven, render_certificate  # noqa: PLC0415  loads jinja2
 
-    proof = proven(store, life)
-    return render_certificate(life, datetime.now(UTC), proof).encode("utf-8")
+    now = datetime.now(UTC)
+    return render_certificate(life, now, proven(store, life, now)).encode("utf-8")
 
 
 # -- one unit -------------------------------------------------------------------------------------
