@@ -807,7 +807,7 @@ class Job:
 
 
 def prepare(
-    image: str | os.PathLike[str] | Image,
+    image: str | os.PathLike[str] | Image | OpenedImage,
     profile: Profile,
     *,
     bitrate_bps: int | None = None,
@@ -816,16 +816,19 @@ def prepare(
     identity: Identity | None = None,
     at_power_up: bool = False,
     waived: Iterable[str] = (),
+    **checks: Any,
 ) -> Job:
     """Prepare an upgrade without a bus: load, plan, and choose defaults. Call `Job.checked` before
     running it.
 
-    `waived` names checks of flasher.host.waivers; `identity` and `options` take precedence. Raises
-    ImageError and UsageError.
+    `waived` names checks of flasher.host.waivers, `checks` are fields of `Identity`; `identity` and
+    `options` take precedence. Raises ImageError and UsageError.
     """
     names = frozenset(waived)
     outside = waivers.OUTSIDE_VECTOR in names
-    if isinstance(image, Image):
+    if isinstance(image, OpenedImage):
+        opened = image
+    elif isinstance(image, Image):
         opened = OpenedImage(image)
     elif identity is None:
         opened = open_image(image, profile.target, allow_outside_vector=outside)
@@ -838,6 +841,7 @@ def prepare(
             release=opened.release,
             waived=frozenset(check for check in WAIVABLE if check.value in names),
             reports_unchecked=at_power_up,
+            **checks,
         )
     if identity.provenance is None:
         provenance = opened.provenance or _unsigned(opened.image.source)

@@ -422,13 +422,10 @@ class BenchController:
         for part in open_bike_set(path):
             profile = self.backend.profile(part.target)
             profile.check_fits(part.opened.image)
-            identity = profile.identity(
-                release=part.opened.release,
-                provenance=part.opened.provenance,
-                skip_same_version=True,
-                images_here=images_here(part.target, self.backend.images()),
+            here = images_here(part.target, self.backend.images())
+            job = prepare(
+                part.opened, profile, bitrate_bps=rate, skip_same_version=True, images_here=here
             )
-            job = prepare(part.opened.image, profile, bitrate_bps=rate, identity=identity)
             jobs[part.target] = part, job.checked()
         return jobs
 
@@ -455,14 +452,14 @@ class BenchController:
         profile = self.backend.profile(target)
         rate = self.backend.bitrate_bps(self.adapter())
         name = visible(path.name)
-        job = prepare(
+        return prepare(
             path,
             profile,
             bitrate_bps=rate,
             at_power_up=self.state.is_rescue,
             waived=[waiver for waived, waiver in self.state.waived if waived == name],
+            images_here=self._images_here,
         ).checked()
-        return replace(job, identity=replace(job.identity, images_here=self._images_here))
 
     def _check_sample(self, image: Image) -> None:
         """Refuse a firmware sample on a real bus; the upgrade checks again. Raises ImageError."""

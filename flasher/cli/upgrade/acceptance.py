@@ -192,8 +192,7 @@ def acceptance(
     opened = api.open_image(image.source, target, **image.options())
     settings.check_fits(opened.image)
     bus = choose_adapter(bus.with_profile(profile), output)
-    identity = settings.identity(release=opened.release, provenance=opened.provenance)
-    job = api.prepare(opened.image, settings, bitrate_bps=bus.bit_rate.bps, identity=identity)
+    job = api.prepare(opened, settings, bitrate_bps=bus.bit_rate.bps)
     try:
         job.checked()
     except FlasherError as error:

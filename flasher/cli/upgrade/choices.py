@@ -14,7 +14,6 @@ from flasher.cli import values
 from flasher.cli.framework import Decorator, option, option_set, rebuild_command_line
 from flasher.cli.options import STANDARD_INPUT, Bus, gap_options, profile_option
 from flasher.errors import ExitCode, UsageError
-from flasher.host.identity import WAIVABLE, IdentityCheck
 from flasher.host.options import DEFAULT_ATTEMPTS, PATIENT_TRIES, UpgradeOptions
 from flasher.host.verify import Level
 from flasher.host.waivers import OF_DEVICE, OUTSIDE_VECTOR, UNSIGNED, WAIVERS
@@ -135,10 +134,6 @@ class UpgradeChoices:
         given: bool = getattr(self, f"allow_{name.replace('-', '_')}")
         return given or (self.force and name != UNSIGNED)
 
-    def waived_checks(self) -> frozenset[IdentityCheck]:
-        """Waived checks of image and device."""
-        return frozenset(check for check in WAIVABLE if self.allows(check.value))
-
     def options(self, profile: Profile, wait: float | None) -> UpgradeOptions:
         """Return the options of the command line, with the profile as default. Raises UsageError
         for options that exclude each other.
@@ -172,21 +167,15 @@ class UpgradeChoices:
         if not self.dry_run and not at_power_up:  # a version is reported
             found = images_here(profile.target, images_beside(path, values.IMAGE_SUFFIXES))
         return api.prepare(
-            opened.image,
+            opened,
             profile,
             bitrate_bps=bus.bit_rate.bps,
             options=self.options(profile, power_up_timeout_s),
             verify=None if self.dry_run else verify,
-            identity=profile.identity(
-                release=opened.release,
-                provenance=opened.provenance,
-                waived=self.waived_checks(),
-                skip_same_version=skip_same_version,
-                reports_unchecked=at_power_up,
-                images_here=found,
-            ),
             at_power_up=at_power_up,
             waived=waived,
+            skip_same_version=skip_same_version,
+            images_here=found,
         )
 
     def keeps_settings(self, profile: Profile) -> bool:
