@@ -33,11 +33,11 @@ from flasher.station.events import (
     UnitArrived,
     UnitRemoved,
 )
-from flasher.station.messages import AdapterDown, AdapterReady, PresenceChanged, RunResult
+from flasher.station.messages import AdapterDown, AdapterReady, PresenceChanged
 from flasher.station.operators import HIDDEN, Asked, Crew
 from flasher.station.pins import FORM_WORDS, Pin, is_form
 from flasher.station.records.errors import Refusal
-from flasher.station.records.model import Admission, AuditEvent, Order, RunState
+from flasher.station.records.model import Admission, AuditEvent, Order, RunResult, RunState
 from flasher.station.scans import (
     Label,
     NotUnderstood,

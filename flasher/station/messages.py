@@ -3,29 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 from flasher.errors import FlasherError
 from flasher.station.config import MockUnits
 from flasher.station.events import OperatorPrompted, Progressed, StepEnded, StepStarted
-from flasher.station.records.model import Claim, Measurement, RunState, Verified, WriteId
+from flasher.station.records.model import Claim, Measurement, RunResult, WriteId
 
 # -- a run --------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class RunResult:
-    """Outcome of a run, before it is saved."""
-
-    outcome: RunState
-    code: str
-    text: str
-    duration_s: float
-    verified: Mapping[str, Verified] = field(default_factory=dict)
-    trace_sha256: str | None = None
-    """SHA-256 of the compressed trace (`packed`); None if it could not be written."""
 
 
 @dataclass(frozen=True)

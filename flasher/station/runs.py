@@ -12,7 +12,7 @@ from typing import Final
 
 from flasher.station import codes
 from flasher.station.codes import CODES, Code
-from flasher.station.messages import RunResult, flash_value, packed, write_key
+from flasher.station.messages import flash_value, packed, write_key
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.errors import RuleBrokenError
 from flasher.station.records.model import (
@@ -25,7 +25,7 @@ from flasher.station.records.model import (
     AttachmentFile,
     Claim,
     RunDetails,
-    RunEnd,
+    RunResult,
     RunState,
     StepName,
     StepState,
@@ -105,13 +105,15 @@ def _attach(store: Store, run: ActiveRun) -> None:
     run.attached = [file]
 
 
-def _ending(run: ActiveRun, result: RunResult) -> RunEnd:
+def _ending(run: ActiveRun, result: RunResult) -> RunResult:
+    """The result as it is saved."""
     code = CODES.get(result.code, codes.INTERNAL)
     log = next((file.sha256 for file in run.attached if file.kind == TRACE), None)
     text = " ".join(filter(None, (sentence(result.text), code.action)))
     if result.outcome is RunState.PASS:
         text = passed_words(result, run.claim)
-    return RunEnd(result.outcome, code.name, text, result.verified, log, tuple(run.attached))
+    files = tuple(run.attached)
+    return replace(result, code=code.name, text=text, trace_sha256=log, attachments=files)
 
 
 def passed_words(result: RunResult, claim: Claim) -> str:

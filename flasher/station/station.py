@@ -59,7 +59,6 @@ from flasher.station.messages import (
     FromWorker,
     JournalWrite,
     PresenceChanged,
-    RunResult,
     WorkerSetup,
     WriteReply,
 )
@@ -78,6 +77,7 @@ from flasher.station.records.model import (
     RunId,
     RunKind,
     RunRecord,
+    RunResult,
     RunState,
     StationClock,
     UnitLife,

@@ -24,12 +24,19 @@ from flasher.errors import (
 from flasher.station import codes
 from flasher.station.continuity import Continuity
 from flasher.station.events import OperatorPrompted, Progressed, StepEnded, StepStarted
-from flasher.station.messages import Journal, JournalError, RunEvent, RunResult
+from flasher.station.messages import Journal, JournalError, RunEvent
 from flasher.station.power import PowerControl
 from flasher.station.presence import BLIND_S, TargetWatcher
 from flasher.station.recipe import AfterRestart, StepRule
 from flasher.station.recipe_file import LoadedRecipe
-from flasher.station.records.model import Claim, Measurement, RunState, StepName, StepState
+from flasher.station.records.model import (
+    Claim,
+    Measurement,
+    RunResult,
+    RunState,
+    StepName,
+    StepState,
+)
 from flasher.station.unit_steps import Act, UnitSteps
 from flasher.station.unit_target import StepFailedError, UnitTarget
 

@@ -43,7 +43,6 @@ from flasher.station.messages import (
     PresenceChanged,
     Quit,
     RunEvent,
-    RunResult,
     ToWorker,
     WorkerSetup,
     WriteReply,
@@ -52,7 +51,7 @@ from flasher.station.messages import (
 from flasher.station.power import PowerCommand, PowerControl
 from flasher.station.presence import BLIND_S, Presence
 from flasher.station.recipe_file import DAMAGED_COPY, LoadedRecipe, load_recipe
-from flasher.station.records.model import Claim, Measurement, RunState
+from flasher.station.records.model import Claim, Measurement, RunResult, RunState
 from flasher.station.unit_run import UnitRun
 from flasher.station.virtual_units import VirtualSocket
 from flasher.trace.recorder import Recorder

@@ -21,8 +21,8 @@ from flasher.protocol.spec import BMS
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import (
     Measurement,
-    RunEnd,
     RunFilter,
+    RunResult,
     RunState,
     StepName,
     StepState,
@@ -71,7 +71,7 @@ def one_run(bench: Bench, serial: str, *, bad: bool) -> None:
     trace.unlink()
     verified = {} if bad else {"bms": Verified.VERSION}
     outcome, code = (RunState.FAIL, "VERSION") if bad else (RunState.PASS, "OK")
-    store.finish(run_id, RunEnd(outcome, code, "", verified, file.sha256, [file]))
+    store.finish(run_id, RunResult(outcome, code, "", 8.0, verified, file.sha256, [file]))
 
 
 def timed(name: str, work: Callable[[], object]) -> None:

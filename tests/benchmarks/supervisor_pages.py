@@ -32,9 +32,9 @@ from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import (
     AuditEvent,
     Order,
-    RunEnd,
     RunFilter,
     RunId,
+    RunResult,
     RunState,
     StepState,
     Verified,
@@ -286,7 +286,9 @@ def _runs(store: Store, clock: FakeClock, recipe: LoadedRecipe, folder: Path) ->
         store.verified(write, BMS_VERSION)
         store.step(claim.run_id, "flash", StepState.PASS, duration_s=8.0)
         file = store.files.add("trace", trace)
-        ending = RunEnd(RunState.PASS, "OK", "", {"bms": Verified.VERSION}, file.sha256, [file])
+        ending = RunResult(
+            RunState.PASS, "OK", "", 8.0, {"bms": Verified.VERSION}, file.sha256, [file]
+        )
         worked = time.perf_counter()
         store.finish(claim.run_id, ending)
         ended = time.perf_counter()

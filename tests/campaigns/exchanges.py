@@ -23,7 +23,7 @@ from flasher.mock.model import MockDevice
 from flasher.mock.table import BootloaderState
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WELLING, WMC
-from flasher.station.messages import RunResult
+from flasher.station.records.model import RunResult
 from flasher.station.worker import IDLE_S
 from tests.station.factory import BMS_VERSION, USUAL
 from tests.station.test_exchanges import (

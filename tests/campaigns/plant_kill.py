@@ -48,7 +48,14 @@ from flasher.plant.verify import PlantExaminer
 from flasher.protocol.spec import BMS
 from flasher.station.records import schema
 from flasher.station.records.keys import KeyLocations
-from flasher.station.records.model import Measurement, Order, RunEnd, RunState, StepState, Verified
+from flasher.station.records.model import (
+    Measurement,
+    Order,
+    RunResult,
+    RunState,
+    StepState,
+    Verified,
+)
 from flasher.station.records.store import Store
 from tests.station.factory import BMS_VERSION, IMAGES, make_recipe
 from tests.station.postgres import Server, find_programs, running_server
@@ -112,10 +119,10 @@ def _one_run(store: Store, recipe: Any, folder: Path, serial: str, chance: rando
     said = run_messages(serial, BMS_VERSION, IMAGES[BMS])
     trace = write_trace(folder / "run.log.gz", said, at_s=time.time())
     file = store.files.add("trace", trace)
-    end = RunEnd(RunState.FAIL, "NO_ANSWER", "", {}, file.sha256, [file])
+    end = RunResult(RunState.FAIL, "NO_ANSWER", "", 8.0, {}, file.sha256, [file])
     if is_good:
         reached = {"bms": Verified.VERSION}
-        end = RunEnd(RunState.PASS, "OK", "", reached, file.sha256, [file])
+        end = RunResult(RunState.PASS, "OK", "", 8.0, reached, file.sha256, [file])
     store.finish(run_id, end)
 
 

@@ -33,9 +33,8 @@ from flasher.image.image import Image
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS
 from flasher.settings.manifest import release_of
-from flasher.station.messages import RunResult
 from flasher.station.recipe_file import LoadedRecipe
-from flasher.station.records.model import Claim, RunId, RunKind, RunState
+from flasher.station.records.model import Claim, RunId, RunKind, RunResult, RunState
 from flasher.station.unit_run import UnitRun
 from tests.campaigns.crossed_scans import Line, Scenario, line_of, make_plan
 from tests.campaigns.scripted_units import NEW_VERSION, Units, bus_of, free_port

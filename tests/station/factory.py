@@ -19,7 +19,15 @@ from flasher.protocol.spec import BMS, OBC, WMC, Target
 from flasher.settings.manifest import release_of, to_toml
 from flasher.station.recipe_file import LoadedRecipe, load_checked
 from flasher.station.records.keys import KeyLocations
-from flasher.station.records.model import Claim, Order, RunEnd, RunId, RunState, StepState, Verified
+from flasher.station.records.model import (
+    Claim,
+    Order,
+    RunId,
+    RunResult,
+    RunState,
+    StepState,
+    Verified,
+)
 from flasher.station.records.store import Store
 from tests.station.traces import run_messages, write_trace
 
@@ -194,10 +202,10 @@ class Bench:
 
     def ending(
         self, state: RunState = RunState.PASS, code: str = "OK", trace: Path | None = None
-    ) -> RunEnd:
+    ) -> RunResult:
         file = self.store.files.add("trace", trace or self.trace)
         verified = {"bms": Verified.VERSION} if state is RunState.PASS else {}
-        return RunEnd(state, code, "", verified, file.sha256, [file])
+        return RunResult(state, code, "", 8.0, verified, file.sha256, [file])
 
     def make(
         self,

@@ -18,7 +18,6 @@ from flasher.station.messages import (
     FromWorker,
     JournalWrite,
     PresenceChanged,
-    RunResult,
     ToWorker,
     WorkerSetup,
     WriteReply,
@@ -28,6 +27,7 @@ from flasher.station.operators import Crew
 from flasher.station.records.model import (
     Claim,
     Measurement,
+    RunResult,
     RunState,
     StepName,
     StepState,

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from flasher.station.events import RunEnded, RunStarted
-from flasher.station.messages import RunResult
-from flasher.station.records.model import RunId, RunKind, RunState
+from flasher.station.records.model import RunId, RunKind, RunResult, RunState
 
 RESULT: Final = RunResult(RunState.PASS, "OK", "", 1.0)
 """The line does not look at it: only what is saved counts."""

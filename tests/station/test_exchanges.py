@@ -18,9 +18,8 @@ from flasher.protocol.spec import BMS, WELLING, WMC, Target
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.settings.manifest import release_of
 from flasher.station.events import OperatorPrompted
-from flasher.station.messages import RunResult
 from flasher.station.recipe_file import LoadedRecipe
-from flasher.station.records.model import RunKind, RunState, StepName
+from flasher.station.records.model import RunKind, RunResult, RunState, StepName
 from tests.station.factory import BMS_VERSION, HEAD, SERIAL_NUMBER, USUAL, target_table
 from tests.station.unit_bench import NEW_UNIT, WRITES, UnitBench
 

@@ -13,8 +13,8 @@ import pytest
 from flasher.station import line, scans
 from flasher.station.events import SocketChanged
 from flasher.station.line import Line
-from flasher.station.messages import AdapterReady, PresenceChanged, RunResult
-from flasher.station.records.model import Admission, Order, RunState
+from flasher.station.messages import AdapterReady, PresenceChanged
+from flasher.station.records.model import Admission, Order, RunResult, RunState
 from flasher.station.socket import Binding, Occupancy, Socket, SocketPhase, Source
 from tests.loops import each
 from tests.station.line_inputs import saved

@@ -34,13 +34,13 @@ from flasher.station.messages import (
     CannotWork,
     JournalWrite,
     PresenceChanged,
-    RunResult,
     flash_value,
 )
 from flasher.station.records.errors import DiskFullError, RecordsLockedError
 from flasher.station.records.model import (
     Measurement,
     RunKind,
+    RunResult,
     RunState,
     StepName,
     UnitState,

@@ -12,9 +12,9 @@ from flasher.bus.link import VirtualClock
 from flasher.errors import UsageError
 from flasher.station.adapters import resolve, worker_setups
 from flasher.station.config import MockUnits, mock_config
-from flasher.station.messages import PresenceChanged, RunResult, VirtualUnits
+from flasher.station.messages import PresenceChanged, VirtualUnits
 from flasher.station.recipe_file import LoadedRecipe
-from flasher.station.records.model import Claim, RunId, RunKind
+from flasher.station.records.model import Claim, RunId, RunKind, RunResult
 from flasher.station.unit_run import UnitRun
 from flasher.station.virtual_units import (
     Health,

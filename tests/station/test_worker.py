@@ -36,7 +36,6 @@ from flasher.station.messages import (
     JournalWrite,
     PresenceChanged,
     Quit,
-    RunResult,
     ToWorker,
     VirtualUnits,
     WorkerSetup,
@@ -44,7 +43,7 @@ from flasher.station.messages import (
     packed,
 )
 from flasher.station.presence import SILENCE_S
-from flasher.station.records.model import Claim, RunId, RunKind, RunState, WriteId
+from flasher.station.records.model import Claim, RunId, RunKind, RunResult, RunState, WriteId
 from flasher.station.unit_run import UnitRun
 from flasher.station.unit_steps import UnitSteps
 from flasher.station.virtual_units import Health, VirtualSocket, make_device

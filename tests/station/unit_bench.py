@@ -15,13 +15,14 @@ from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import BMS, WELLING, Target
 from flasher.station.events import StepEnded
-from flasher.station.messages import JournalError, JournalWrite, RunEvent, RunResult
+from flasher.station.messages import JournalError, JournalWrite, RunEvent
 from flasher.station.power import PowerControl
 from flasher.station.records.model import (
     Claim,
     Measurement,
     RunId,
     RunKind,
+    RunResult,
     Signature,
     StepName,
     StepState,

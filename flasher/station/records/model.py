@@ -359,18 +359,20 @@ class AttachmentFile:
 
 
 @dataclass(frozen=True)
-class RunEnd:
-    """End of a run: everything that `Store.finish` saves in one transaction."""
+class RunResult:
+    """Outcome of a run: reported by its process, and saved by `Store.finish` in one transaction."""
 
-    state: RunState
+    outcome: RunState
     code: str
     """Stable code of the cause, for example "NO_ANSWER"; "OK" for a PASS."""
     text: str
-    """Message for people: what happened and what to do."""
+    """Message for people: what happened; when it is saved, also what to do."""
+    duration_s: float
     verified: Mapping[str, Verified] = field(default_factory=dict)
     """Verification level reached, by target name."""
-    log_sha256: str | None = None
-    """SHA-256 of the bus trace, which is also an attachment."""
+    trace_sha256: str | None = None
+    """SHA-256 of the compressed trace of the bus, also an attachment; None if it could not be
+    written."""
     attachments: Sequence[AttachmentFile] = ()
 
 

@@ -8,7 +8,7 @@
     store.verified(write, "V1r0r4_20220512")
     store.step(claim.run_id, "flash", StepState.PASS, ...)
     trace = store.files.add("trace", path)
-    store.finish(claim.run_id, RunEnd(RunState.PASS, "OK", "", ...))   # only now show PASS
+    store.finish(claim.run_id, RunResult(RunState.PASS, "OK", ...))   # only now show PASS
 
 Whatever raises RecordError has saved nothing; a run that could not be finished stays RUNNING, and
 `finish` may be tried again with the same ending. Threads may share a store that is in a file: every
@@ -62,9 +62,9 @@ from flasher.station.records.model import (
     Measurement,
     Order,
     PassedTwice,
-    RunEnd,
     RunExamination,
     RunId,
+    RunResult,
     RunState,
     StationClock,
     StepState,
@@ -314,16 +314,16 @@ class Store:
 
     # -- ending -----------------------------------------------------------------------------------
 
-    def finish(self, run_id: RunId, ending: RunEnd) -> None:
+    def finish(self, run_id: RunId, ending: RunResult) -> None:
         """Save the end of a run in one transaction. Only after it returns may PASS be shown.
 
         May be called again with the same ending after an error. Raises RuleBrokenError for an
         unproven PASS (verification below the recipe's, no trace, a failed step, an unverified
         write, a missing file), RecordError if nothing was saved.
         """
-        if ending.state not in OUTCOMES:
+        if ending.outcome not in OUTCOMES:
             raise RuleBrokenError(
-                f"{ending.state.value} is not an end of a run.", where=f"run {run_id}"
+                f"{ending.outcome.value} is not an end of a run.", where=f"run {run_id}"
             )
         for file in ending.attachments:
             wrong = self.files.check(file.sha256)
@@ -337,7 +337,7 @@ class Store:
             found = connection.execute(saved).one_or_none()
             if found is None:
                 raise NotFoundError(f"There is no run {run_id}.")
-            if found == (ending.state.value, ending.code, ending.text, ending.log_sha256):
+            if found == (ending.outcome.value, ending.code, ending.text, ending.trace_sha256):
                 return
             for name, level in ending.verified.items():
                 changed = connection.execute(
@@ -354,13 +354,13 @@ class Store:
                 run_id,
                 ending.attachments,
                 now,
-                state=ending.state.value,
+                state=ending.outcome.value,
                 code=ending.code,
                 text=ending.text,
                 ended_monotonic_s=self._clock.monotonic_s(),
                 # The weakest of all targets.
                 verification_reached=None if not reached or None in reached else min(reached),
-                log_sha256=ending.log_sha256,
+                log_sha256=ending.trace_sha256,
             )
 
     def note(self, event: AuditEvent, data: Mapping[str, Any], run_id: RunId | None = None) -> None:

@@ -31,8 +31,9 @@ from flasher.protocol.spec import (
     WELLING,
     Mode,
 )
-from flasher.station.messages import Ask, FromWorker, RunResult, ToWorker, WorkerSetup
+from flasher.station.messages import Ask, FromWorker, ToWorker, WorkerSetup
 from flasher.station.recipe_file import LoadedRecipe
+from flasher.station.records.model import RunResult
 from flasher.station.worker import StationGoneError, StationPipe, work_on
 
 _WRITE: Final = HEADER + Mode.WRITE.to_bytes(MODE_SIZE, "big")

@@ -34,10 +34,10 @@ from flasher.station.events import (
     StepStarted,
     WorkerFailed,
 )
-from flasher.station.messages import FromWorker, RunResult, WorkerSetup
+from flasher.station.messages import FromWorker, WorkerSetup
 from flasher.station.presence import SILENCE_S
 from flasher.station.records.errors import RecordError
-from flasher.station.records.model import RunFilter, RunState, StepName
+from flasher.station.records.model import RunFilter, RunResult, RunState, StepName
 from flasher.station.socket import Source
 from flasher.station.station import Station
 from tests.campaigns.line_world import stories

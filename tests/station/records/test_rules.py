@@ -10,7 +10,14 @@ from typing import Any
 import pytest
 
 from flasher.station.records.errors import RuleBrokenError
-from flasher.station.records.model import Measurement, RunEnd, RunId, RunState, StepState, Verified
+from flasher.station.records.model import (
+    Measurement,
+    RunId,
+    RunResult,
+    RunState,
+    StepState,
+    Verified,
+)
 from flasher.station.records.schema import metadata
 from flasher.station.records.triggers import RULES
 from tests.station.factory import BMS_VERSION, Bench
@@ -134,10 +141,10 @@ def test_the_rules_of_one_row_hold_without_triggers(
         assert why in refused(other, ENDED.format(reached=reached, log=log))
 
 
-def ending_with(bench: Bench, **changes: object) -> RunEnd:
+def ending_with(bench: Bench, **changes: object) -> RunResult:
     """A good ending with changes."""
     good = bench.ending()
-    return RunEnd(**{**good.__dict__, **changes})
+    return RunResult(**{**good.__dict__, **changes})
 
 
 @pytest.mark.parametrize(
@@ -145,14 +152,14 @@ def ending_with(bench: Bench, **changes: object) -> RunEnd:
     [
         (lambda b: ending_with(b, verified={}), "verified"),
         (lambda b: ending_with(b, verified={"bms": Verified.COMPLETED}), "verified"),
-        (lambda b: ending_with(b, log_sha256=None), "log"),
-        (lambda b: ending_with(b, log_sha256=SHA), "log attached"),
+        (lambda b: ending_with(b, trace_sha256=None), "log"),
+        (lambda b: ending_with(b, trace_sha256=SHA), "log attached"),
         (lambda b: ending_with(b, attachments=()), "log attached"),
         (lambda b: ending_with(b, code=""), "finished_has_a_code"),
     ],
 )
 def test_a_false_pass_is_not_saved(
-    bench: Bench, spoil: Callable[[Bench], RunEnd], why: str
+    bench: Bench, spoil: Callable[[Bench], RunResult], why: str
 ) -> None:
     run_id = bench.claim().run_id
     bench.work(run_id)
