@@ -28,7 +28,7 @@ from flasher.cli.files import check_writable
 from flasher.cli.framework import command_line, option, option_set, typed_values
 from flasher.cli.options import Bus
 from flasher.cli.output import Output
-from flasher.cli.stop import stop_on_signal
+from flasher.cli.stop import Stop, stop_on_signal
 from flasher.cli.values import TRACE_SUFFIXES, FilePath, FolderPath
 from flasher.driver import Tap
 from flasher.errors import (
@@ -135,11 +135,12 @@ class Recording:
         """Record an error that the command reports without raising it."""
         self.failure = error
 
-    def leave_terminal(self, output: Output) -> None:
-        """Record that the terminal is lost."""
-        if not self.is_alone:
+    def hung_up(self, stop: Stop, output: Output) -> bool:
+        """True if the terminal is lost, which is recorded."""
+        if stop.has_hung_up and not self.is_alone:
             self.is_alone = True
             output.leave_terminal("the terminal is gone")
+        return stop.has_hung_up
 
     def link_report(self) -> LinkReport | None:
         """Bus usage of the transfer so far; None before the first packet."""

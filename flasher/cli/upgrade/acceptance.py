@@ -394,7 +394,6 @@ class _Walk:
 
                 def on_event(event: object) -> None:
                     nonlocal reached
-                    self.output.event(event)
                     progress(event)
                     if isinstance(event, PacketAcknowledged):
                         reached = event.number

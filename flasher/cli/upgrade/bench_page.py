@@ -164,18 +164,16 @@ class _Place:
         cancelled: Callable[[], bool],
     ) -> UpgradeEnding:
         output = self._output
+        job = self._begun(adapter, job)
 
         @contextmanager
         def watching(connection: Connection, record: Recording) -> Iterator[CallOptions]:
             output.progress(f"{job.plan.target.node.name} on {connection.name} ...")
-
-            def hung_up() -> bool:
-                if self._stop.has_hung_up:
-                    record.leave_terminal(output)
-                return self._stop.has_hung_up
-
-            listener = self._listener(adapter, job, on_event)
-            yield {"on_event": listener, "cancelled": cancelled, "hung_up": hung_up}
+            yield {
+                "on_event": self._listener(adapter, job, on_event),
+                "cancelled": cancelled,
+                "hung_up": partial(record.hung_up, self._stop, output),
+            }
 
         upgrade_run = UpgradeRun(job, self.bus(adapter), RecordingOptions(), output)
         upgrade_run.keeps_settings = keeps_settings
@@ -185,14 +183,22 @@ class _Place:
             result = upgrade_run.write_planned(connect, watching)
         except FlasherError as error:
             upgrade_run.error = error
+        self._ended(adapter)
         bundle = None if upgrade_run.record is None else upgrade_run.record.bundle
         return UpgradeEnding(result, upgrade_run.error, bundle, upgrade_run.warning)
+
+    def _begun(self, _adapter: Adapter, job: Job) -> Job:
+        """Return the upgrade to run."""
+        return job
 
     def _listener(
         self, _adapter: Adapter, _job: Job, on_event: Callable[[object], None]
     ) -> Callable[[object], None]:
         """Create the listener for events of an upgrade that begins."""
         return on_event
+
+    def _ended(self, _adapter: Adapter) -> None:
+        """End an upgrade."""
 
 
 @dataclass
@@ -269,28 +275,12 @@ class VirtualBikes(_Place):
     def connect(self, adapter: Adapter, *, asks: bool = True) -> AbstractContextManager[Connection]:
         return self._bikes[adapter.name].connect()
 
-    def upgrade(
-        self,
-        adapter: Adapter,
-        job: Job,
-        connect: Callable[[], AbstractContextManager[Connection]],
-        *,
-        keeps_settings: bool,
-        on_event: Callable[[object], None],
-        cancelled: Callable[[], bool],
-    ) -> UpgradeEnding:
+    def _begun(self, _adapter: Adapter, job: Job) -> Job:
         """Limit the attempts, to show a bike's fault before the overall deadline."""
-        limited = replace(job, options=replace(job.options, attempts=DEFAULT_ATTEMPTS))
-        ending = super().upgrade(
-            adapter,
-            limited,
-            connect,
-            keeps_settings=keeps_settings,
-            on_event=on_event,
-            cancelled=cancelled,
-        )
+        return replace(job, options=replace(job.options, attempts=DEFAULT_ATTEMPTS))
+
+    def _ended(self, adapter: Adapter) -> None:
         self._bikes[adapter.name].ended()
-        return ending
 
     def _listener(
         self, adapter: Adapter, job: Job, on_event: Callable[[object], None]

@@ -281,18 +281,9 @@ class BikeUpgrade:
 
         @contextmanager
         def watching(_: api.Connection, record: Recording) -> Iterator[api.CallOptions]:
+            hung_up = partial(record.hung_up, stop, output)
             with Progress(device.job.plan, output) as progress:
-
-                def hung_up() -> bool:
-                    if stop.has_hung_up:
-                        record.leave_terminal(output)
-                    return stop.has_hung_up
-
-                def on_event(event: object) -> None:
-                    output.event(event)
-                    progress(event)
-
-                yield {"on_event": on_event, "cancelled": stop.asked, "hung_up": hung_up}
+                yield {"on_event": progress, "cancelled": stop.asked, "hung_up": hung_up}
 
         try:
             if device is not self._devices[0]:

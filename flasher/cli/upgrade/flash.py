@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import click
@@ -291,21 +292,12 @@ class _Upgrade:
                 lambda: output.error_line("stopping at the end of the message ...")
             ) as stop,
         ):
-
-            def hung_up() -> bool:
-                if stop.has_hung_up:
-                    record.leave_terminal(output)
-                return stop.has_hung_up
-
-            def on_event(event: object) -> None:
-                output.event(event)
-                progress(event)
-
             # A device before power-up, or in an open session, may be silent.
             if not job.options.at_power_up and not job.options.in_session:
                 device = connection.device(self.target, dialect=self.bus.dialect)
                 check_heard(device, self.bus, output, taps=record.taps, cancelled=stop.asked)
-            yield {"on_event": on_event, "cancelled": stop.asked, "hung_up": hung_up}
+            hung_up = partial(record.hung_up, stop, output)
+            yield {"on_event": progress, "cancelled": stop.asked, "hung_up": hung_up}
 
     def _add_repair(self, error: FlasherError) -> None:
         """Add the command that repairs a device left without an application."""

@@ -14,7 +14,7 @@ from flasher.protocol.spec import PACKET_DATA_SIZE
 
 
 class Progress:
-    """Shows the events of an upgrade."""
+    """Shows the events of an upgrade, and prints them with --events."""
 
     def __init__(self, plan: Plan, output: Output) -> None:
         self._size_bytes = plan.image.size_bytes
@@ -34,6 +34,7 @@ class Progress:
         self._output.shows = lambda _event: False
 
     def __call__(self, event: object) -> None:
+        self._output.event(event)
         match event:
             case events.PacketAcknowledged(number, total, _):
                 note = f"{self._repetitions} repeated" if self._repetitions else ""
