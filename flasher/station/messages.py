@@ -110,16 +110,14 @@ class WriteReply:
 
 
 @dataclass(frozen=True)
-class Abort:
-    """Stop the run: a person aborted it."""
+class Stop:
+    """Stop the run."""
+
+    ends_process: bool = False
+    """End the process after that."""
 
 
-@dataclass(frozen=True)
-class Quit:
-    """End the process, after stopping an active run."""
-
-
-ToWorker = Claim | WriteReply | Abort | Quit
+ToWorker = Claim | WriteReply | Stop
 
 # -- from the process -----------------------------------------------------------------------------
 
@@ -139,11 +137,11 @@ class Beat:
 
 @dataclass(frozen=True)
 class AdapterDown:
-    """The adapter failed, the process died, or the copy of the plant's recipe is damaged; all are
-    tried again.
-    """
+    """The adapter failed, the process died, or the recipe cannot be used."""
 
     reason: str
+    is_final: bool = False
+    """It is not tried again, and the process ends: a local recipe changed or a setting is wrong."""
 
 
 @dataclass(frozen=True)
@@ -183,15 +181,6 @@ class Ask:
     measurements: tuple[Measurement, ...] = ()
 
 
-@dataclass(frozen=True)
-class CannotWork:
-    """The process ends and must not be restarted: a local recipe changed or a setting is wrong."""
-
-    reason: str
-
-
 RunEvent = StepStarted | Progressed | OperatorPrompted
 """Progress of a run, for display. The station adds the socket."""
-FromWorker = (
-    AdapterReady | Beat | AdapterDown | PresenceChanged | Ask | RunEvent | RunResult | CannotWork
-)
+FromWorker = AdapterReady | Beat | AdapterDown | PresenceChanged | Ask | RunEvent | RunResult

@@ -52,13 +52,13 @@ from flasher.station.label_printer import LabelJob, LabelPrinter
 from flasher.station.label_template import values_of
 from flasher.station.line import ARRIVAL_LIMIT_S, Line
 from flasher.station.messages import (
-    Abort,
     AdapterDown,
     AdapterReady,
     Ask,
     FromWorker,
     JournalWrite,
     PresenceChanged,
+    Stop,
     WorkerSetup,
     WriteReply,
 )
@@ -409,7 +409,7 @@ class Station:
                     case line.DropAdmission(admission):
                         self._gate.dropped(admission)
                     case line.AbortRun(socket):
-                        self.supervisor.send(socket, Abort())
+                        self.supervisor.send(socket, Stop())
                     case line.SaveAgain(sockets):
                         saved = [self._save(socket) for socket in sockets]  # try every one
                         all_saved = self._end_unknown() and all(saved)
@@ -454,7 +454,7 @@ class Station:
     def _abort_running(self) -> None:
         for socket in self.line.sockets.values():
             if socket.phase is SocketPhase.RUN:
-                self.supervisor.send(socket.name, Abort())
+                self.supervisor.send(socket.name, Stop())
 
     def _pin_checked(self, checked: Future[bool]) -> None:
         """Put the result of a PIN check into the queue; called in the checker's thread."""

@@ -10,7 +10,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, Final, Protocol
 
 from flasher.processes import signals_blocked
-from flasher.station.messages import CannotWork, FromWorker, Quit, ToWorker, WorkerSetup
+from flasher.station.messages import AdapterDown, FromWorker, Stop, ToWorker, WorkerSetup
 from flasher.station.worker import worker_main
 
 HANG_S: Final = 10.0
@@ -179,14 +179,14 @@ class WorkerSupervisor:
         if slot.port is None:
             slot.start_at = self._now()  # it waited before a restart, or could not work
         else:
-            slot.port.send(Quit())
+            slot.port.send(Stop(ends_process=True))
             slot.replace_by = self._now() + _QUIT_S
 
     def close(self) -> None:
         """Ask all processes to end; kill those that do not end in time."""
         ports = list(self.ports.values())
         for port in ports:
-            port.send(Quit())
+            port.send(Stop(ends_process=True))
         give_up_at = self._now() + _QUIT_S
         for port in ports:
             port.join(max(0.0, give_up_at - self._now()))
@@ -205,7 +205,7 @@ class WorkerSupervisor:
         try:
             while len(messages) < _MESSAGES_AT_ONCE and (message := port.receive()) is not None:
                 messages.append(message)
-                if isinstance(message, CannotWork):
+                if isinstance(message, AdapterDown) and message.is_final:
                     slot.reason = message.reason
         except (EOFError, OSError):
             return messages, True

@@ -31,18 +31,16 @@ from flasher.protocol.text import printable
 from flasher.station import codes
 from flasher.station.events import StepEnded
 from flasher.station.messages import (
-    Abort,
     AdapterDown,
     AdapterReady,
     Ask,
     Beat,
-    CannotWork,
     FromWorker,
     JournalError,
     JournalWrite,
     PresenceChanged,
-    Quit,
     RunEvent,
+    Stop,
     ToWorker,
     WorkerSetup,
     WriteReply,
@@ -191,10 +189,9 @@ class StationPipe:
                 self._claim = message
             case WriteReply():
                 self._replies[message.number] = message
-            case Abort():
+            case Stop(ends_process):
                 self.is_aborted = True
-            case Quit():
-                self.is_over = True
+                self.is_over = self.is_over or ends_process
 
 
 class Worker:
@@ -408,7 +405,7 @@ def load_when_whole(pipe: StationPipe, setup: WorkerSetup) -> LoadedRecipe | Non
             return load_same(setup)
         except FlasherError as error:
             if not setup.is_from_plant:
-                pipe.send(CannotWork(error.what))
+                pipe.send(AdapterDown(error.what, is_final=True))
                 return None
             if not is_down:
                 pipe.send(AdapterDown(error.what))
@@ -431,7 +428,7 @@ def work_on(
             with opened() as (connection, virtual):
                 Worker(setup, recipe, pipe, connection, virtual).work()
         except UsageError as error:
-            pipe.send(CannotWork(error.what))
+            pipe.send(AdapterDown(error.what, is_final=True))
             return
         except BusError as error:
             if not is_down:

@@ -23,7 +23,7 @@ from flasher.errors import ExitCode
 from flasher.settings.toml_reader import TomlTable
 from flasher.station.config import StationConfig
 from flasher.station.events import SocketState, StationEvent, StepStarted
-from flasher.station.messages import CannotWork
+from flasher.station.messages import AdapterDown
 from flasher.station.operators import BadgeTable
 from flasher.station.pins import Pin, is_right
 from flasher.station.recipe import Recipe
@@ -331,7 +331,7 @@ def test_sockets_that_can_never_work_end_the_station(
         def receive(self) -> Any:
             if not self.said:
                 self.said = True
-                return CannotWork("The recipe was changed.")
+                return AdapterDown("The recipe was changed.", is_final=True)
             raise EOFError
 
     monkeypatch.setattr("flasher.cli.station.run.LAUNCH", Broken)

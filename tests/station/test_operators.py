@@ -25,7 +25,7 @@ from flasher.station.events import (
     StationStarted,
 )
 from flasher.station.line import CheckPin
-from flasher.station.messages import Abort
+from flasher.station.messages import Stop
 from flasher.station.operators import (
     HIDDEN,
     PIN_LIMIT_S,
@@ -161,7 +161,7 @@ def test_an_override_needs_a_role_that_may(bench: Bench, badge: str) -> None:
             assert refusal(line) == "NOT_ALLOWED"
         is_resumed = command == "RESUME" and badge == SUPERVISOR
         assert (line.of(LineResumed) != []) == is_resumed
-        stops = [each for each in line.ports["A"].heard if isinstance(each, Abort)]
+        stops = [each for each in line.ports["A"].heard if isinstance(each, Stop)]
         assert (stops != []) == (command == "ABORT A" and badge != OPERATOR)
         line.station.close()
         line.station.store.recover()
@@ -213,7 +213,7 @@ def test_what_changed_before_the_pin_came_is_looked_at_again(line: LineBench) ->
     line.end("A")
     line.scan(PIN)
     assert refusal(line) == "NOT_RUNNING"
-    assert not [each for each in line.ports["A"].heard if isinstance(each, Abort)]
+    assert not [each for each in line.ports["A"].heard if isinstance(each, Stop)]
 
 
 def test_wrong_pins_are_limited_and_the_limit_ends(line: LineBench, bench: Bench) -> None:

@@ -30,7 +30,7 @@ from flasher.station.given_recipes import (
     bundle_of,
     parse_bundle,
 )
-from flasher.station.messages import AdapterReady, Quit
+from flasher.station.messages import AdapterReady, Stop
 from flasher.station.operators import Crew, Person, Role
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.recipe_offers import RecipeOffers, approved, used
@@ -92,7 +92,7 @@ class Plant:
     def restart(self, socket: str) -> None:
         """The old process of a socket ends, and the next one is ready."""
         old = self.line.ports[socket]
-        assert isinstance(old.heard[-1], Quit)
+        assert old.heard[-1] == Stop(ends_process=True)
         old.is_gone = True
         self.line.turn()
         self.line.turn()
@@ -222,7 +222,7 @@ def test_a_run_finishes_with_the_recipe_that_it_began_with(plant: Plant) -> None
     digest = plant.give(REVISION_5)
     plant.approve(digest)
     old = line.ports["A"]
-    assert not any(isinstance(message, Quit) for message in old.heard)
+    assert not any(isinstance(message, Stop) for message in old.heard)
     plant.restart("B")  # this one was idle
     line.work("A")
     line.end("A")

@@ -27,13 +27,12 @@ from flasher.station.events import (
 )
 from flasher.station.line import IDENTIFY_S, REACH_S, READ_S
 from flasher.station.messages import (
-    Abort,
     AdapterDown,
     AdapterReady,
     Beat,
-    CannotWork,
     JournalWrite,
     PresenceChanged,
+    Stop,
     flash_value,
 )
 from flasher.station.records.errors import DiskFullError, RecordsLockedError
@@ -518,7 +517,7 @@ def test_a_person_aborts_a_run(line: LineBench) -> None:
     line.scan(SERIAL)
     line.arrive("A")
     line.scan("ABORT A")
-    assert isinstance(line.ports["A"].heard[-1], Abort)
+    assert line.ports["A"].heard[-1] == Stop()
     line.end("A", RunState.ABORTED, "OPERATOR_ABORT")
     assert line.state("A") is SocketState.RECHECK
 
@@ -725,7 +724,7 @@ def test_a_process_that_hangs_is_ended_and_started_again(line: LineBench) -> Non
 
 
 def test_a_process_that_cannot_work_is_not_started_again(line: LineBench) -> None:
-    line.ports["A"].said.append(CannotWork("The recipe was changed."))
+    line.ports["A"].said.append(AdapterDown("The recipe was changed.", is_final=True))
     line.ports["A"].is_gone = True
     line.turn()
     line.bench.clock.go_on(5.0)
@@ -829,7 +828,7 @@ def test_a_station_that_ends_stops_its_runs_and_saves_them(line: LineBench) -> N
     line.arrive("A")
     line.station.abort_all()
     line.turn()
-    assert any(isinstance(message, Abort) for message in line.ports["A"].heard)
+    assert any(message == Stop() for message in line.ports["A"].heard)
     line.end("A", RunState.ABORTED, "OPERATOR_ABORT")
     line.station.close()
     assert line.last(RunEnded).outcome is RunState.ABORTED

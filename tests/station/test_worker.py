@@ -26,7 +26,6 @@ from flasher.protocol.spec import WELLING
 from flasher.station.config import MockUnits
 from flasher.station.events import StepStarted
 from flasher.station.messages import (
-    Abort,
     AdapterDown,
     AdapterReady,
     Ask,
@@ -35,7 +34,7 @@ from flasher.station.messages import (
     JournalError,
     JournalWrite,
     PresenceChanged,
-    Quit,
+    Stop,
     ToWorker,
     VirtualUnits,
     WorkerSetup,
@@ -105,7 +104,7 @@ class Socket:
             case Ask(number):
                 channel.waiting.append(WriteReply(number, WriteId(number), self.error))
             case RunResult():
-                channel.waiting.append(Quit())
+                channel.waiting.append(Stop(ends_process=True))
 
     def work(self) -> RunResult | None:
         worker = Worker(self.setup, self.recipe, self.line, self.virtual.connection, self.virtual)
@@ -166,7 +165,7 @@ def test_a_person_aborts_between_two_messages(tmp_path: Path) -> None:
             and isinstance(message.what, JournalWrite)
             and not message.what.write_id
         ):
-            channel.waiting.append(Abort())
+            channel.waiting.append(Stop())
 
     socket.channel._answer = abort
     ended = socket.work()
@@ -250,7 +249,7 @@ class RealAdapter(Socket):
         if isinstance(message, AdapterReady):
             self.ready_at.append(self.clock.now())
             if channel.of(AdapterDown):
-                channel.waiting.append(Quit())
+                channel.waiting.append(Stop(ends_process=True))
             else:
                 self.bus.unplug(back_after_s=2.5)
 
@@ -288,7 +287,7 @@ def test_a_socket_that_cannot_be_used_is_told_and_not_tried_again(tmp_path: Path
         raise UsageError("There is no such interface.")
 
     work_on(socket.line, socket.setup, socket.recipe, opened)
-    assert socket.kinds == ["CannotWork"]
+    assert [each.is_final for each in socket.channel.of(AdapterDown)] == [True]
 
 
 def test_a_damaged_copy_of_the_plants_recipe_is_reported_once_and_loaded_when_it_is_whole(
@@ -316,7 +315,7 @@ def test_a_damaged_copy_of_the_plants_recipe_is_reported_once_and_loaded_when_it
 def test_a_damaged_copy_is_not_waited_for_when_another_recipe_was_approved(tmp_path: Path) -> None:
     socket = RealAdapter(tmp_path)
     (tmp_path / "bms.bin.toml").unlink()
-    socket.channel.waiting.append(Quit())
+    socket.channel.waiting.append(Stop(ends_process=True))
     assert load_when_whole(socket.line, replace(socket.setup, is_from_plant=True)) is None
     assert socket.kinds == ["AdapterDown"]
 
@@ -325,7 +324,7 @@ def test_a_local_recipe_that_was_changed_is_not_tried_again(tmp_path: Path) -> N
     socket = RealAdapter(tmp_path)
     (tmp_path / "bms.bin.toml").unlink()
     assert load_when_whole(socket.line, socket.setup) is None
-    assert socket.kinds == ["CannotWork"]
+    assert [each.is_final for each in socket.channel.of(AdapterDown)] == [True]
 
 
 # -- the unit of the label ------------------------------------------------------------------------
@@ -434,7 +433,7 @@ class PulledAfterItsRun(RealSocket):
             self.pulled_at = self.clock.now()
         elif isinstance(message, PresenceChanged) or self.clock.now() > self.pulled_at + 60.0:
             self.gone_at = self.clock.now()
-            channel.waiting.append(Quit())
+            channel.waiting.append(Stop(ends_process=True))
 
 
 def test_a_unit_that_is_pulled_after_its_run_is_missed_soon(tmp_path: Path) -> None:
