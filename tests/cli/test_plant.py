@@ -6,6 +6,7 @@ import errno
 import io
 import json
 import multiprocessing
+import re
 import sqlite3
 import subprocess
 import sys
@@ -195,6 +196,7 @@ def test_status_and_send(flasher: Flasher, plant: Plant) -> None:
     assert both.document["checks"]["line-2"][0] == {
         "kind": "refused", "state": "ok", "text": "its records are accepted",
     }  # fmt: skip
+    assert re.search(r"^  disk:      [0-9.]+ GiB free$", run.out, re.MULTILINE)
     assert "  not known: yield: too few units in this shift: 0 of 20" in run.out.splitlines()
     alert = flasher("plant", "status", "--database", url, "--silent", "0")
     assert alert.code == ExitCode.PARTIAL

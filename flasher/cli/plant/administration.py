@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sqlalchemy import make_url
 
-from flasher.cli.output import Output, byte_count, counted, duration, utc_time
+from flasher.cli.output import Output, counted, duration, utc_time
 from flasher.cli.plant.commands import BoundsOptions
 from flasher.cli.plant.documents import (
     PlantFetchDocument,
@@ -176,7 +176,7 @@ def _lines(of: StationOverview) -> Iterator[str]:
         if used.published:
             yield printable(f"    not approved yet: {used.published[:16]}")
     if each.disk_free_bytes is not None:
-        yield f"  disk:      {byte_count(each.disk_free_bytes)} free"
+        yield f"  disk:      {each.disk_free_bytes / 1024**3:.1f} GiB free"
     for check in of.checks:
         if check.state is CheckState.UNKNOWN:
             yield printable(f"  not known: {check.kind.value}: {check.text}")
