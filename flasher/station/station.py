@@ -88,7 +88,7 @@ from flasher.station.runs import ActiveRun, passed_words, save, with_history
 from flasher.station.scans import Refused, Word
 from flasher.station.socket import UNNAMED, Socket, SocketPhase, Source
 from flasher.station.supervisor import Launch, ProcessPort, WorkerLost, WorkerSupervisor
-from flasher.station.virtual_units import next_number
+from flasher.station.virtual_units import next_number, number_of_first
 
 TURN_S: Final = 0.1
 """Maximum time that a turn of the loop waits."""
@@ -616,7 +616,8 @@ class Station:
         if virtual is None:
             return setup
         rule, part = recipe.recipe.serial_number, recipe.recipe.part
-        number = next_number(rule, lambda serials: self.store.read.known(part, serials))
+        start = number_of_first(self.store.station)
+        number = next_number(rule, lambda serials: self.store.read.known(part, serials), start)
         number += (virtual.first_number - number) % virtual.number_step
         return replace(setup, virtual=replace(virtual, first_number=number))
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import random
 import re
+import zlib
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -50,6 +51,8 @@ SLOW_ERASE_S: Final = 0.02
 _DIGITS: Final = re.compile(r"[0-9]+")
 _SERIALS_TRIED: Final = 2000
 _NUMBERS_TRIED: Final = 10_000
+_BLOCK: Final = 100
+_BLOCKS: Final = 90
 
 
 class Health(StrEnum):
@@ -100,9 +103,20 @@ def serial_numbers(rule: SerialNumberRule, first: int, step: int) -> Iterator[st
     )
 
 
-def next_number(rule: SerialNumberRule, known: Callable[[Collection[str]], Collection[str]]) -> int:
-    """The number after the last virtual unit in the records. `known` returns those of the given
-    serial numbers that are recorded.
+def number_of_first(station: str) -> int:
+    """The number with which the virtual units of a station of a plant begin: those of stations with
+    the same recipe differ, or they would look like duplicates.
+    """
+    return 1 + zlib.crc32(station.encode("utf-8")) % _BLOCKS * _BLOCK
+
+
+def next_number(
+    rule: SerialNumberRule,
+    known: Callable[[Collection[str]], Collection[str]],
+    first: int = 1,
+) -> int:
+    """The number after the last virtual unit in the records; `first` without one. `known` returns
+    those of the given serial numbers that are recorded.
     """
     numbers: dict[str, int] = {}
     for number in range(1, _NUMBERS_TRIED):
@@ -110,7 +124,7 @@ def next_number(rule: SerialNumberRule, known: Callable[[Collection[str]], Colle
             numbers.setdefault(next(serial_numbers(rule, number, 1)), number)
         except UsageError:
             break
-    return max((numbers[serial] for serial in known(numbers)), default=0) + 1
+    return max((numbers[serial] for serial in known(numbers)), default=first - 1) + 1
 
 
 @dataclass(frozen=True)

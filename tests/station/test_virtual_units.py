@@ -21,6 +21,7 @@ from flasher.station.virtual_units import (
     VirtualSocket,
     health_of,
     next_number,
+    number_of_first,
     serial_numbers,
 )
 from tests.station.factory import DAY, HEAD, SERIAL_NUMBER, USUAL, make_recipe
@@ -57,6 +58,26 @@ def test_the_next_number_comes_after_the_last_one_that_records_know(
 ) -> None:
     rule = make_recipe(tmp_path).recipe.serial_number
     assert next_number(rule, set(known).intersection) == number
+
+
+def test_virtual_units_of_two_stations_of_a_plant_do_not_look_like_duplicates(
+    tmp_path: Path,
+) -> None:
+    rule = make_recipe(tmp_path).recipe.serial_number
+    first, second = (
+        set(
+            islice(
+                serial_numbers(
+                    rule, next_number(rule, frozenset().intersection, number_of_first(name)), 1
+                ),
+                50,
+            )
+        )
+        for name in ("line-2", "line-3")
+    )
+    assert not first & second
+    (after,) = islice(serial_numbers(rule, next_number(rule, first.intersection), 1), 1)
+    assert after not in first
 
 
 def test_check_digits_are_kept(tmp_path: Path) -> None:

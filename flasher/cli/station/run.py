@@ -52,7 +52,7 @@ from flasher.station.records.store import Store
 from flasher.station.socket import FILE, PIPE, TERMINAL
 from flasher.station.station import SCANS_ENDED, Station, StationOptions
 from flasher.station.supervisor import Launch, ProcessPort
-from flasher.station.virtual_units import next_number
+from flasher.station.virtual_units import next_number, number_of_first
 
 if TYPE_CHECKING:
     from flasher.cli.station.pages import OperatorView
@@ -122,8 +122,11 @@ def run(
         )  # fmt: skip
         first = 1
         if is_virtual:  # serial numbers that are not in the records yet
+            start = number_of_first(config.name) if config.plant else 1
             first = max(
-                next_number(each.recipe.serial_number, partial(store.read.known, each.recipe.part))
+                next_number(
+                    each.recipe.serial_number, partial(store.read.known, each.recipe.part), start
+                )
                 for each in recipes.values()
             )
         output.has_opened = True
