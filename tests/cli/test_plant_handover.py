@@ -20,12 +20,12 @@ from flasher.plant.deliveries import Deliveries
 from flasher.plant.delivery_list import deliveries_of
 from tests.cli.conftest import Flasher, Run
 from tests.cli.test_schema import hold_output
-from tests.plant.conftest import plant, sender
+from tests.plant.conftest import no_running_loop, plant, sender
 from tests.plant.factory import COURIER, PASSWORD, READER, Plant, Sender
 from tests.plant.receiver import Act, Receiver, receiving
 from tests.schema_document import SCHEMA
 
-__all__ = ["plant", "sender"]
+__all__ = ["no_running_loop", "plant", "sender"]
 pytestmark = pytest.mark.slow
 
 
