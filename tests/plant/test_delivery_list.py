@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import pytest
 
@@ -17,7 +18,8 @@ from flasher.plant.setup import setup
 from flasher.station.records.newest import PageCursor
 from flasher.web.query_processes import Question
 from flasher.web.supervisor import SupervisorPages
-from tests.plant.factory import COURIER, READER, Plant, Sender
+from tests.plant.factory import COURIER, READER, Plant
+from tests.station.postgres import Server
 
 SERIALS = ["W2605002", "W2605003", "W2605004"]
 BEGIN = datetime.min.replace(tzinfo=UTC)
@@ -47,19 +49,26 @@ class Desk:
         return row.key
 
 
-@pytest.fixture
-def desk(plant: Plant, sender: Sender) -> Iterator[Desk]:
+@pytest.fixture(scope="module")
+def delivering(postgres: Server, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The database of `desk`, made once."""
+    plant = Plant(postgres, tmp_path_factory.mktemp("plant"))
     with closing(Central(plant.url(COURIER))) as central:
         Deliveries(central).register(["mes", "erp"])
-        for serial in SERIALS:
-            sender.bench.make(serial=serial)
-        sender.send()
-        other = plant.sender("line-3")
-        other.bench.make(serial="W2605009")
-        other.send()
-        other.close()
-        with plant.connect() as owner:  # an hour after each other
-            owner.execute("UPDATE chain_row SET arrived_at = arrived_at + id * interval '1 hour'")
+    for station, serials in (("line-2", SERIALS), ("line-3", ["W2605009"])):
+        with closing(plant.sender(station)) as sender:
+            for serial in serials:
+                sender.bench.make(serial=serial)
+            sender.send()
+    with plant.connect() as owner:  # an hour after each other
+        owner.execute("UPDATE chain_row SET arrived_at = arrived_at + id * interval '1 hour'")
+    return plant.database
+
+
+@pytest.fixture
+def desk(postgres: Server, tmp_path: Path, delivering: str) -> Iterator[Desk]:
+    plant = Plant(postgres, tmp_path, delivering)
+    with closing(Central(plant.url(COURIER))) as central:
         yield Desk(plant, central)
 
 

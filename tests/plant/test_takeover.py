@@ -397,7 +397,7 @@ def test_claims_of_a_pc_stay_until_its_own_records_come(
         each.claims.close()
 
 
-@pytest.mark.parametrize("sent", [1, 2, 4, 6])
+@pytest.mark.parametrize("sent", [1, 4])  # rows: none of a run, and one of the second run
 def test_a_branch_that_was_sent_in_part_is_completed_after_the_next_takeover(
     plant: Plant, sender: Sender, key: bytes, spares: list[Sender], sent: int,
     monkeypatch: pytest.MonkeyPatch,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from pathlib import Path
 
 import pytest
 
@@ -14,6 +15,7 @@ from flasher.station.records.model import RunId, RunState
 from flasher.station.records.newest import PageCursor
 from flasher.station.records.overview import Overview
 from tests.plant.factory import READER, Plant, Sender
+from tests.station.postgres import Server
 
 
 def opened(plant: Plant) -> PlantStore:
@@ -26,16 +28,23 @@ def examined(plant: Plant) -> PlantExamination:
         return PlantExaminer(store, lambda _done, _total: None).examine_plant()
 
 
-@pytest.fixture
-def two(plant: Plant, sender: Sender) -> Plant:
-    """A plant in which two stations have sent a run each."""
-    other = plant.sender("line-3")
-    sender.bench.make()
-    other.bench.make(RunState.FAIL, serial="W2605003")
-    for each in (sender, other):
-        each.send()
-    other.close()
+@pytest.fixture(scope="module")
+def sent(postgres: Server, tmp_path_factory: pytest.TempPathFactory) -> Plant:
+    """A plant in which two stations have sent a run each; no test changes it."""
+    plant = Plant(postgres, tmp_path_factory.mktemp("plant"))
+    for station, state, serial in (
+        ("line-2", RunState.PASS, "W2605002"), ("line-3", RunState.FAIL, "W2605003")
+    ):  # fmt: skip
+        with closing(plant.sender(station)) as sender:
+            sender.bench.make(state, serial)
+            sender.send()
     return plant
+
+
+@pytest.fixture
+def two(sent: Plant, postgres: Server, tmp_path: Path) -> Plant:
+    """A copy of it."""
+    return Plant(postgres, tmp_path, sent.database)
 
 
 def test_what_the_stations_sent_is_as_they_signed_it(two: Plant) -> None:
@@ -108,9 +117,11 @@ def test_certificates_are_left_to_the_stations(two: Plant) -> None:
         store.examine_run(RunId(1))
 
 
-def test_traces_are_read_from_the_database(two: Plant, sender: Sender) -> None:
+def test_traces_are_read_from_the_database(plant: Plant, sender: Sender) -> None:
+    sender.bench.make()
+    sender.send()
     own = sender.bench.store.read.run(RunId(1))
-    with closing(opened(two)) as store:
+    with closing(opened(plant)) as store:
         sha256 = str(own.run.log_sha256)
         assert store.files.read(sha256) == sender.bench.store.files.read(sha256)
         assert store.files.check("0" * 64) == "An attachment is missing."

@@ -18,7 +18,7 @@ OWNER = "postgres"
 _INSTALLED = Path("/usr/lib/postgresql")
 _RULES = f"""\
 host all {OWNER} 127.0.0.1/32 trust
-host all all 127.0.0.1/32 scram-sha-256
+host all all 127.0.0.1/32 md5
 """
 _FAST = "-c fsync=off -c synchronous_commit=off -c full_page_writes=off -c max_connections=60"
 _DURABLE = "-c shared_buffers=1GB -c max_wal_size=4GB -c max_connections=60"
