@@ -1,11 +1,23 @@
-"""Tables of rows as one test item each: an item costs more than what many a row tests."""
+"""What tests go through in a loop: tables of rows as one item each, since an item costs more than
+what many a row tests; and in the gate a sample of what a sweep goes through.
+"""
 
 from __future__ import annotations
 
 import functools
 import inspect
+import os
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, TypeVar
+
+SWEEPS = "FLASHER_TEST_SWEEPS"
+"""With this variable the tests go through the whole of what they take a sample of in the gate."""
+_T = TypeVar("_T")
+
+
+def sample(of_gate: _T, whole: _T) -> _T:
+    """Return how much a test goes through: all of it with `python -m tests.campaigns.sweeps`."""
+    return whole if SWEEPS in os.environ else of_gate
 
 
 def each(names: str, values: Iterable[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:

@@ -37,6 +37,7 @@ from flasher.station.records.model import (
     RunState,
 )
 from flasher.web.query_processes import Question
+from tests.loops import sample
 from tests.plant.claims_world import Centre, Claimed, Station, World, _Claims
 from tests.plant.factory import COURIER, READER, Plant, Sender
 from tests.station.factory import HEAD, SERIAL, SERIAL_NUMBER, USUAL
@@ -431,7 +432,7 @@ def test_the_model_of_the_virtual_stations_answers_like_postgresql(
     plant: Plant, lines: tuple[Line, Line]
 ) -> None:
     """Random questions, ends and expiries; the database and the model give equal answers."""
-    for seed in range(3):
+    for seed in range(sample(1, 3)):
         chosen = random.Random(seed)
         serial = f"W260510{seed}"
         model = Centre(lines[0].bench.clock)

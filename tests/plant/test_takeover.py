@@ -33,6 +33,7 @@ from flasher.station.records.model import AuditEvent, RunId, RunState, UnitState
 from flasher.station.records.server import ServerLock
 from flasher.station.records.signatures import SigningKey
 from flasher.station.records.store import Store
+from tests.loops import sample
 from tests.plant.factory import READER, Plant, Sender
 from tests.plant.test_claims import Line, expire
 from tests.plant.test_retire import MONTH_S, retired
@@ -397,7 +398,7 @@ def test_claims_of_a_pc_stay_until_its_own_records_come(
         each.claims.close()
 
 
-@pytest.mark.parametrize("sent", [1, 4])  # rows: none of a run, and one of the second run
+@pytest.mark.parametrize("sent", sample([1, 4], [1, 2, 4, 6]))
 def test_a_branch_that_was_sent_in_part_is_completed_after_the_next_takeover(
     plant: Plant, sender: Sender, key: bytes, spares: list[Sender], sent: int,
     monkeypatch: pytest.MonkeyPatch,

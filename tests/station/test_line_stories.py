@@ -31,10 +31,11 @@ from tests.campaigns.line_world.play import Played, draw, play, shrink
 from tests.campaigns.line_world.promises import Violation
 from tests.campaigns.line_world.stories import CLAUSES, Story
 from tests.campaigns.line_world.world import STUCK
+from tests.loops import sample
 
 pytestmark = pytest.mark.slow
 
-SAMPLE = 8
+SAMPLE = sample(2, 8)
 SAMPLE_ACTS = 24
 PULLED_IN_ITS_FLASH = (
     "line sockets=2 ; unit label=1 ; unit label=3 pace=slow ; person name=jo ;"

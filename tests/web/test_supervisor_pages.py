@@ -72,7 +72,7 @@ def test_every_page_is_for_everybody(tab: Tab, url: str, path: str) -> None:
     for width, scheme in _SCREENS:
         page.set_viewport_size({"width": width, "height": 844})
         page.emulate_media(color_scheme=scheme)
-        assert barriers(page) == ""
+        assert barriers(page, looks_alone=width > 390) == ""
         assert page.evaluate("document.scrollingElement.scrollWidth - innerWidth") <= 0, width
     assert page.locator("main").inner_text().strip()
     assert all(each.startswith(url) for each in tab.asked)
@@ -125,7 +125,8 @@ def test_a_certificate_is_checked_by_a_page(
         page.set_input_files("input[type=file]", file)
         page.locator("#check button").click()
         page.wait_for_selector(f"#found .verdict.{verdict}")
-        assert barriers(page) == ""
+        # The languages differ in words alone.
+        assert language != "en" or barriers(page) == ""
     assert tab.wrong == []
 
 

@@ -25,6 +25,7 @@ from flasher.station.records.queries import Records
 from flasher.station.records.rollup import Rollup
 from flasher.station.shift_counts import DEFAULT_SHIFTS
 from flasher.web.supervisor import shifts_of, spans_of
+from tests.loops import sample
 from tests.plant.factory import Plant
 from tests.station.factory import Bench
 from tests.station.postgres import OWNER
@@ -152,7 +153,8 @@ def filters() -> Iterator[dict[str, Any]]:
 
 def periods(chance: random.Random) -> Iterator[Span]:
     midnight = BEGIN.astimezone().replace(hour=0, minute=0)
-    yield Span(midnight - timedelta(days=40), midnight + timedelta(days=40))
+    around = timedelta(days=sample(9, 40))
+    yield Span(midnight - around, midnight + around)
     begin = BEGIN + timedelta(hours=chance.randint(-30, 40), minutes=chance.randint(0, 59))
     yield Span(begin, begin + timedelta(hours=chance.randint(60, 130)))
     yield Span(begin, begin + timedelta(hours=chance.randint(1, 40)))
@@ -163,7 +165,7 @@ def figures_of(overview: Overview, records: Records, chance: random.Random) -> l
     found: list[Any] = []
     for span in periods(chance):
         shifts = list(shifts_of(span, DEFAULT_SHIFTS))
-        for words in chance.sample(list(filters()), 2):
+        for words in chance.sample(list(filters()), sample(1, 2)):
             chosen = RunFilter(since=span.begin, until=span.end, **words)
             found.append(
                 [overview.yields(chosen, spans) for spans in ([span], list(spans_of(span)))]
