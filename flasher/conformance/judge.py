@@ -216,10 +216,10 @@ class Judge:
         self._unanswered = 0
 
     def conclude(self) -> None:
-        """Record how many stimuli were heard. A case of which none was heard does not pass."""
+        """Record how many stimuli were received. A case of which none was does not pass."""
         if not self._stimuli:
             return
-        got = f"{self._heard} of {self._stimuli} stimuli were heard"
+        got = f"{self._heard} of {self._stimuli} stimuli were received"
         self.info(got)
         if not self._heard:
             expected = "the device listens when a stimulus is sent"

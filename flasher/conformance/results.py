@@ -37,7 +37,7 @@ class CaseVerdict(Enum):
     DEVIATION = "deviation"
     """Failed in the way that the profile documents."""
     INCONCLUSIVE = "inconclusive"
-    """The uncertainty of a measurement exceeds the margin, no stimulus was heard, or two runs
+    """The uncertainty of a measurement exceeds the margin, no stimulus was received, or two runs
     differ.
     """
     NOT_RUN = "not_run"

@@ -68,7 +68,9 @@ OF_DEVICE: Final[Mapping[str, Waiver]] = {
 OF_IMAGE: Final[Mapping[str, Waiver]] = {
     UNSIGNED: Waiver(
         text("an image that the trust file of this computer does not allow"),
-        text("Nobody vouches for it: it may be a forgery, or an old release with known faults."),
+        text(
+            "No trusted key has signed it: it may be forged, or an old release with known faults."
+        ),
     ),
     OUTSIDE_VECTOR: Waiver(
         text("an image whose reset vector points outside of it"),

@@ -324,7 +324,7 @@ def _check_signatures(
     name = target.node.name
     if role is None:
         raise ImageError(
-            text("Nobody may sign images for the {target}.", target=name),
+            text("No key may sign images for the {target}.", target=name),
             where=text("version {version} of the trust file", version=trust.version),
             remedy=text("Take a newer trust file from the maker of this target's firmware."),
             code=ErrorCode.RELEASE_UNSIGNED,

@@ -832,7 +832,7 @@ class Line:
         if not self._crew.has_badges:
             raise Refused(
                 "NO_BADGES",
-                text("Nobody can be identified: this station has no badge table."),
+                text("No person can be identified: this station has no badge table."),
                 text("Name the badge table in the station file."),
             )
         self._effects.append(ApproveRecipe(argument, self._with_author({})))

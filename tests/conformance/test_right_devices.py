@@ -252,7 +252,7 @@ def test_a_case_without_a_stimulus_that_was_heard_does_not_pass() -> None:
 def test_a_case_states_how_many_of_its_stimuli_were_heard(case_id: str) -> None:
     report = run(subject(), profile_of_mock(), selection=Selection(cases=(case_id,)))
     (result,) = report.results
-    (text,) = [info for info in result.infos if "stimuli were heard" in info]
+    (text,) = [info for info in result.infos if "stimuli were received" in info]
     heard, _, sent, *_ = text.split()
     assert heard == sent
     assert int(sent) > 1

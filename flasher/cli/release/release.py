@@ -542,7 +542,7 @@ def _print(output: Output, package: verify.Package) -> None:
                 + release.sha256,
             )
         )
-    signed = ", ".join(shown.signed_by) or "nobody yet"
+    signed = ", ".join(shown.signed_by) or "no key yet"
     rows.append(("signatures of:", f"{signed} (not checked here)"))
     if package.chain is not None:
         rows.append(

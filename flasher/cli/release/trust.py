@@ -308,7 +308,7 @@ def init(
     made = grants.applied(first)
     if not made.root.keys:
         raise UsageError(
-            "Nobody could sign the next version of this trust file.",
+            "No key could sign the next version of this trust file.",
             remedy="Give a key the role root: --grant root=FILE.",
         )
     return _sign_and_write(output, new_chain(_checked(made, file), file), keys, passphrases)

@@ -174,7 +174,7 @@ def acceptance(
         )
     if not yes and not can_ask():
         raise UsageError(
-            "The acceptance asks a person, and nobody can answer here.",
+            "The acceptance asks a person, and no person can answer here.",
             cause="standard input or standard error is not a terminal",
             remedy="Run it in a terminal, or add --yes (and --interrupt) to agree beforehand.",
         )
@@ -324,7 +324,7 @@ class _Walk:
         if self.agreed:
             return "it answers; not compared with the label by a person"
         if not self._asks(f"The {node} reports: {shown}.\nIs that the device in front of you?"):
-            raise _StepError("the person said that this is not the device in front of them")
+            raise _StepError("a person answered that this is not the device in front of them")
         return "it answers, and a person compared it with the label"
 
     def _read(self, device: api.Device) -> None:
