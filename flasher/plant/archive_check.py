@@ -19,7 +19,7 @@ from flasher.plant.schema import OWN_PARTS, SHARED_PARTS, kept_run
 from flasher.protocol.text import printable
 from flasher.station.records import chain
 from flasher.station.records.errors import RecordsDamagedError
-from flasher.station.records.examination import Examiner, Readable, RunDigests, Trail
+from flasher.station.records.examination import ExaminedTrail, Examiner, Readable, RunDigests
 from flasher.station.records.files import FileStore
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import Problem, RunDetails, RunId, WriteId
@@ -149,7 +149,9 @@ class ArchiveExaminer(AssembledExaminer):
         reader = ArchiveReader(self._path)
         shown = printable(self._path.name)
         trails = {
-            station: Trail(each.name, each.first - 1, each.previous_hash, keys=list(each.keys))
+            station: ExaminedTrail(
+                each.name, each.first - 1, each.previous_hash, keys=list(each.keys)
+            )
             for station, each in self._chains.items()
         }
         problems: list[Problem] = []

@@ -25,7 +25,7 @@ from flasher.plant.store import PlantStore, shared_parts
 from flasher.protocol.text import printable
 from flasher.station.records import chain, schema
 from flasher.station.records.errors import RecordError
-from flasher.station.records.examination import Trail, same_traces
+from flasher.station.records.examination import ExaminedTrail, same_traces
 from flasher.station.records.model import Problem
 from flasher.station.records.queries import is_whole
 from flasher.station.records.rows import batches
@@ -167,7 +167,7 @@ class PlantExaminer(AssembledExaminer):
         self._traces += found.traces
 
     def _station(
-        self, connection: Connection, station: UUID, trail: Trail, records_id: str
+        self, connection: Connection, station: UUID, trail: ExaminedTrail, records_id: str
     ) -> Iterator[Problem]:
         """Examine a chain, then its runs."""
         query = (
@@ -230,15 +230,17 @@ def _gaps(files: Mapping[str, Sequence[ArchivedChain]]) -> Iterator[Problem]:
         ends[each.station] = each
 
 
-def _begun(connection: Connection, station: UUID) -> tuple[Trail, str]:
+def _begun(connection: Connection, station: UUID) -> tuple[ExaminedTrail, str]:
     """The chain's station and records, as its first row states them, or its part in files."""
     retired = last_archived(connection, station)
     if retired.last:
         keys = list(retired.keys)
-        return Trail(retired.name, retired.last, retired.hash, keys=keys), retired.records_id
+        return ExaminedTrail(
+            retired.name, retired.last, retired.hash, keys=keys
+        ), retired.records_id
     query = select(chain_row.c.data).where(chain_row.c.station == station, chain_row.c.number == 1)
     data = chain.data_of(connection.execute(query).scalar_one_or_none() or "")
-    return Trail(str(data.get("station", station))), str(data.get("records", ""))
+    return ExaminedTrail(str(data.get("station", station))), str(data.get("records", ""))
 
 
 def _station_of(records_id: str, name: str) -> UUID:

@@ -87,7 +87,7 @@ class Violation:
 
 
 @dataclass
-class Claim:
+class Reported:
     """What a run reports of itself."""
 
     ending: str
@@ -151,14 +151,14 @@ class Facts:
         self.rules.begin_run()
 
 
-def judge(facts: Facts, claim: Claim) -> Iterator[Violation]:
+def judge(facts: Facts, reported: Reported) -> Iterator[Violation]:
     """Return what a run claims wrongly, or does against the protocol."""
-    if claim.is_overdue:
+    if reported.is_overdue:
         yield Violation("OVERDUE", f"not at an end {facts.limit_s:.0f} s after its deadline")
         return
-    if claim.exit_code not in DOCUMENTED:
-        yield Violation("UNDOCUMENTED", f"exit code {claim.exit_code}")
-    if claim.is_ok != (claim.exit_code == ExitCode.OK):
+    if reported.exit_code not in DOCUMENTED:
+        yield Violation("UNDOCUMENTED", f"exit code {reported.exit_code}")
+    if reported.is_ok != (reported.exit_code == ExitCode.OK):
         yield Violation("UNDOCUMENTED", "success and exit code differ")
     # An adapter that can send nothing is waited for.
     blocked_s = SEND_LIMIT_S if not facts.plan.job.others or _has(facts.plan, _BLOCKS) else 0.0
@@ -168,21 +168,21 @@ def judge(facts: Facts, claim: Claim) -> Iterator[Violation]:
         yield Violation("LATE", f"ended at {share:.4f} of the announced deadline")
     if facts.interrupted_s > _INTERRUPTED_S + blocked_s + paused_s:
         yield Violation("LATE", f"ended {facts.interrupted_s:.1f} s after Ctrl-C")
-    if claim.ending == "cancelled" and facts.rules.has_half_message:
+    if reported.ending == "cancelled" and facts.rules.has_half_message:
         yield Violation("WIRE", "cancelled in the middle of a message")
     if facts.host_ids - {facts.request_id}:
         ids = ", ".join(f"0x{each:03X}" for each in sorted(facts.host_ids - {facts.request_id}))
         yield Violation("FOREIGN", f"frames with the id {ids}")
     for text in facts.rules.broken():
         yield Violation("WIRE", text)
-    if claim.ending == "refused" and facts.rules.ends < 2 and not _has(facts.plan, _BLOCKS):
+    if reported.ending == "refused" and facts.rules.ends < 2 and not _has(facts.plan, _BLOCKS):
         yield Violation("WIRE", "refused, and end of transfer was sent once only (R6)")
-    yield from _judge_failure(facts, claim)
-    yield from _judge_report(facts, claim)
-    yield from _judge_contents(facts, claim)
+    yield from _judge_failure(facts, reported)
+    yield from _judge_report(facts, reported)
+    yield from _judge_contents(facts, reported)
 
 
-def _judge_report(facts: Facts, claim: Claim) -> Iterator[Violation]:
+def _judge_report(facts: Facts, reported: Reported) -> Iterator[Violation]:
     """Check what a run reports beside its success."""
     plan = facts.plan
     device = plan.devices[0]
@@ -190,18 +190,18 @@ def _judge_report(facts: Facts, claim: Claim) -> Iterator[Violation]:
     is_riding = "battery_use=riding" in str(device) and is_running
     if is_riding and len(plan.devices) == 1 and facts.may_have_erased and not [*plan.events]:
         yield Violation("WIRE", "an update command to a battery that is in use")
-    if claim.acknowledged > plan.job.packets:
-        text = f"{claim.acknowledged} acknowledged packets of {plan.job.packets}"
+    if reported.acknowledged > plan.job.packets:
+        text = f"{reported.acknowledged} acknowledged packets of {plan.job.packets}"
         yield Violation("STATISTICS", text)
     # Of a killed run, the device may be left in its transfer: the way out of it is not counted.
     counts_attempts = plan.job.attempts and not _has(plan, (plans.Kill,))
-    if counts_attempts and claim.attempts > plan.job.attempts:
-        text = f"{claim.attempts} attempts, and {plan.job.attempts} were allowed"
+    if counts_attempts and reported.attempts > plan.job.attempts:
+        text = f"{reported.attempts} attempts, and {plan.job.attempts} were allowed"
         yield Violation("STATISTICS", text)
     if not facts.rules.has_version_answer:
-        if claim.reports_version:
+        if reported.reports_version:
             yield Violation("FALSE", "a version is reported, and the device sent none")
-        elif claim.is_ok and plan.job.target == "bms":
+        elif reported.is_ok and plan.job.target == "bms":
             yield Violation("FALSE", "success, and the new application never sent its version")
     looks_like_two = [each for each in plan.clauses if isinstance(each, _LOOKS_LIKE_TWO)]
     # A message that comes again at once is doubled by the line.
@@ -212,7 +212,7 @@ def _judge_report(facts: Facts, claim: Claim) -> Iterator[Violation]:
     is_single &= not answers or answers == [plans.Answer(when=answers[0].when, becomes="twice")]
     # While a host waits for room in a short queue, it cannot read how close two answers are.
     is_single &= not answers or plan.adapter.queue >= FRAMES_PER_PACKET
-    if "two_devices" in claim.ending and is_single:
+    if "two_devices" in reported.ending and is_single:
         yield Violation("ACCUSED", "two devices are reported, and there is one")
 
 
@@ -226,10 +226,10 @@ def _restart_s(device: plans.Device) -> float:
     return 0.0
 
 
-def _judge_failure(facts: Facts, claim: Claim) -> Iterator[Violation]:
+def _judge_failure(facts: Facts, reported: Reported) -> Iterator[Violation]:
     """Check that a run without success had a reason, and enough time."""
     plan, job = facts.plan, facts.plan.job
-    if claim.is_ok or job.timeout:
+    if reported.is_ok or job.timeout:
         return
     packets_s = job.packets * TIMES.ack_timeout_s
     least_s = (job.attempts or _ATTEMPTS) * (_BEGIN_S + packets_s) + _COMPLETE_S
@@ -244,7 +244,7 @@ def _judge_failure(facts: Facts, claim: Claim) -> Iterator[Violation]:
         yield Violation("FAILED", "no success, and nothing was disturbed")
 
 
-def _judge_contents(facts: Facts, claim: Claim) -> Iterator[Violation]:
+def _judge_contents(facts: Facts, reported: Reported) -> Iterator[Violation]:
     contents = [each.now for each in facts.units]
     if any(each.runs_nothing for each in facts.units):
         yield Violation("CORRUPT", "the device runs an application that it does not have")
@@ -257,13 +257,13 @@ def _judge_contents(facts: Facts, claim: Claim) -> Iterator[Violation]:
     shows = all(each.was_heard for each in present) and not _has(facts.plan, (plans.Answer,))
     is_unseen = len(present) > 1 and not shows
     may_be_unseen = len(present) > 1 or _has(facts.plan, (plans.Tool,))
-    is_unseen |= claim.unobserved_s > 0 and may_be_unseen
+    is_unseen |= reported.unobserved_s > 0 and may_be_unseen
     false = "UNSEEN" if is_unseen else "FALSE"
     content, *twins = contents
-    if claim.is_ok and content != "new":
+    if reported.is_ok and content != "new":
         yield Violation(false, f"success, and the device has {content}")
     for twin, unit in zip(twins, facts.units[1:], strict=True):
-        if claim.is_ok and twin != "new" and unit.took_part:
+        if reported.is_ok and twin != "new" and unit.took_part:
             yield Violation(false, f"success, and its twin has {twin}")
     if (
         "other" in (content, *facts.started)
@@ -273,16 +273,16 @@ def _judge_contents(facts: Facts, claim: Claim) -> Iterator[Violation]:
         yield Violation("CORRUPT", "the device would start what is neither old nor new")
     if not facts.may_have_erased:
         return  # whoever erased it, it was not the host
-    is_refused = claim.left is DeviceLeft.NO_APPLICATION and content == "new"
+    is_refused = reported.left is DeviceLeft.NO_APPLICATION and content == "new"
     if is_refused and len(contents) == 1 and not _has(facts.plan, _LIES_AT_THE_END):
         yield Violation("DISHONEST", "no application is reported, and the device has the new one")
     # Another tool may erase a device that was complete, while its version is asked. Its commands
     # are those of this tool: an adapter of unknown kind may be returning its own.
-    is_others = claim.left is DeviceLeft.NEW and _has(facts.plan, (plans.Tool,))
+    is_others = reported.left is DeviceLeft.NEW and _has(facts.plan, (plans.Tool,))
     has_lost = content == "none" != facts.before
-    if not (claim.needs_rescue or claim.is_ok or is_others) and has_lost:
+    if not (reported.needs_rescue or reported.is_ok or is_others) and has_lost:
         yield Violation("DISHONEST", "no need of rescue, and the device has no application")
-    if claim.left is DeviceLeft.UNTOUCHED and content != facts.before:
+    if reported.left is DeviceLeft.UNTOUCHED and content != facts.before:
         yield Violation("DISHONEST", f"untouched, and the device has {content}")
 
 

@@ -55,7 +55,7 @@ from flasher.simulate.independent import (
     IndependentDevice,
     frames_of,
 )
-from flasher.simulate.oracle import Claim, Facts, SubjectFailedError, UnitFacts, Violation, judge
+from flasher.simulate.oracle import Facts, Reported, SubjectFailedError, UnitFacts, Violation, judge
 from flasher.simulate.reached import fault_place, reading_place
 from flasher.simulate.wire_rules import WireRules
 
@@ -456,8 +456,8 @@ class Player:
             # The history of this computer has a run without an end.
             options = replace(self._options, in_session=runs > 1, at_power_up=self._has_operator)
             limit_s = overall_timeout_s(self.image_plan, options)
-            claim = self._run(options, began_at + limit_s * OVERDUE_SHARE + OVERDUE_S)
-            if claim is not None:
+            reported = self._run(options, began_at + limit_s * OVERDUE_SHARE + OVERDUE_S)
+            if reported is not None:
                 break
             self._wait(self.clock.now() + self._again_after_s)
         ended_at = self.clock.now()
@@ -481,26 +481,26 @@ class Player:
             )
             for unit, content in zip(self.units, at_end, strict=True)
         ]
-        is_good = claim.is_ok and self.units[0].application == self.image_plan.image.data
+        is_good = reported.is_ok and self.units[0].application == self.image_plan.image.data
         if is_good:
             self._reached |= set(map(reading_place, self._readings()))
         if self._bench is not None:
             unit = self.units[0]
             facts.started = [self._name(each, unit) for each in unit.engine.started]  # type: ignore[union-attr]
-        violations = [*judge(facts, claim)]
+        violations = [*judge(facts, reported)]
         recovered = ""
-        if not (claim.is_ok or violations) and len(self.units) == 1:
-            recovered = self._recover(claim, was_killed=runs > 1)
+        if not (reported.is_ok or violations) and len(self.units) == 1:
+            recovered = self._recover(reported, was_killed=runs > 1)
             if not recovered:
                 lost = self._content(self.units[0])
                 violations.append(Violation("LOST", f"not brought back: the device has {lost}"))
         return Verdict(
             plan=str(self.plan),
-            ending=claim.ending,
-            exit_code=claim.exit_code,
+            ending=reported.ending,
+            exit_code=reported.exit_code,
             is_good=is_good,
             left=left,
-            attempts=claim.attempts,
+            attempts=reported.attempts,
             took_s=took_s,
             lateness=took_s / limit_s,
             share_of_bus_time=took_s / self.image_plan.wire_s,
@@ -509,7 +509,7 @@ class Player:
             runs=runs,
             reached=frozenset(self._reached),
             wire=self._wire(),
-            where=claim.where,
+            where=reported.where,
         )
 
     def _wire(self) -> str:
@@ -529,7 +529,7 @@ class Player:
         if self._is_silence_answered:
             yield "R26"
 
-    def _run(self, options: UpgradeOptions, overdue_at: float) -> Claim | None:
+    def _run(self, options: UpgradeOptions, overdue_at: float) -> Reported | None:
         """Run the command once; None if its process was killed."""
         self._phase = "idle"
         self._link = link = PlanLink(self.bus, self.plan.adapter, overdue_at)
@@ -548,9 +548,11 @@ class Player:
         except KilledError:
             return None
         except OverdueError:
-            return Claim("overdue", -1, is_ok=False, left=None, needs_rescue=True, is_overdue=True)
+            return Reported(
+                "overdue", -1, is_ok=False, left=None, needs_rescue=True, is_overdue=True
+            )
         except FlasherError as error:
-            return Claim(
+            return Reported(
                 f"error {error.code}",
                 int(error.exit_code),
                 is_ok=False,
@@ -558,9 +560,9 @@ class Player:
                 needs_rescue=error.needs_rescue,
                 where=f"{error.where}: {error.what}",
             )
-        return _claim_of(result)
+        return _reported_by(result)
 
-    def _recover(self, claim: Claim, *, was_killed: bool) -> str:
+    def _recover(self, reported: Reported, *, was_killed: bool) -> str:
         """Run the commands that the documents advise, without faults, for an operator who follows
         each prompt; return the one that succeeded.
         """
@@ -570,7 +572,7 @@ class Player:
             # It refuses an image without one: another image is advised.
             self.image_plan = self._image_plan(has_checksum=True)
         self._has_operator = True
-        in_session = was_killed or claim.needs_rescue
+        in_session = was_killed or reported.needs_rescue
         options = replace(self._options, attempts=None, timeout_s=None, frame_gap_s=0.0)
         for name, run in (
             ("flash", replace(options, in_session=in_session)),
@@ -644,13 +646,13 @@ def _options(job: plans.Job, options: UpgradeOptions) -> UpgradeOptions:
     return replace(options, timeout_s=job.timeout) if job.timeout else options
 
 
-def _claim_of(result: Result) -> Claim:
+def _reported_by(result: Result) -> Reported:
     outcome, error = result.outcome, result.error()
     needs_rescue = outcome.device_left.needs_rescue if error is None else error.needs_rescue
     ending = outcome.ending.value
     if outcome.ok and not result.verification.ok:
         ending += f", {result.verification.verdict.value}"
-    return Claim(
+    return Reported(
         ending,
         int(result.exit_code),
         is_ok=result.ok,

@@ -61,7 +61,7 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass
-class Trail:
+class ExaminedTrail:
     """One station's chain while it is examined."""
 
     station: str
@@ -140,7 +140,7 @@ class Examiner:
         self._unkept: list[str] = []
         self._unreached: list[str] = []
         self._since = since
-        self._trails_found: list[Trail] = []
+        self._trails_found: list[ExaminedTrail] = []
         self.examined: Examined | None = None
         """State for the next examination; None until this one is done, or if it found a problem."""
         self._traces = 0
@@ -281,7 +281,7 @@ class Examiner:
                 yield _PlaceHeads(place, is_elsewhere=True, lasts=found)
 
     def _compare(
-        self, connection: Connection, trail: Trail, each: _PlaceHeads, records_id: str
+        self, connection: Connection, trail: ExaminedTrail, each: _PlaceHeads, records_id: str
     ) -> Iterator[Problem]:
         """Compare a chain with the heads that a place stores of it."""
         shown, place = printable(trail.station), each.place.shown
@@ -357,7 +357,7 @@ class Examiner:
 
     def _chain(
         self,
-        trail: Trail,
+        trail: ExaminedTrail,
         rows: Iterable[Mapping[Any, Any]],
         records_id: str,
     ) -> Iterator[Problem]:
@@ -582,14 +582,14 @@ def _is_as_examined(connection: Connection, since: Examined) -> bool:
     return bool(connection.execute(runs).scalar_one() == since.runs)
 
 
-def _continued_trail(name: str, since: Examined | None) -> Trail:
+def _continued_trail(name: str, since: Examined | None) -> ExaminedTrail:
     """The state of a station's chain at the end of the last examination."""
     each = None if since is None else since.chains.get(name)
     if each is None:
-        return Trail(name)
+        return ExaminedTrail(name)
     restored = {number: range(first, last + 1) for number, (first, last) in each.restored.items()}
     stated = (each.version, each.schema)
-    return Trail(
+    return ExaminedTrail(
         name, each.rows, each.hash, restored=restored, keys=list(each.keys), stated=stated,
         first=dict(each.first),
     )  # fmt: skip
@@ -694,7 +694,9 @@ def _run_digests(connection: Connection, run_ids: list[int]) -> dict[int, RunDig
     return found
 
 
-def _segment_faults(trail: Trail, place: str, entry: Checkpoint | HeadsFault) -> Iterator[Problem]:
+def _segment_faults(
+    trail: ExaminedTrail, place: str, entry: Checkpoint | HeadsFault
+) -> Iterator[Problem]:
     shown = printable(trail.station)
     if isinstance(entry, HeadsFault):
         yield Problem(f"heads of {shown}, {entry.where}", entry.what)
@@ -704,7 +706,7 @@ def _segment_faults(trail: Trail, place: str, entry: Checkpoint | HeadsFault) ->
 
 
 def _without_accepted(
-    trail: Trail, wrong: list[tuple[int, ChainHead]], accepted_at: Mapping[int, int]
+    trail: ExaminedTrail, wrong: list[tuple[int, ChainHead]], accepted_at: Mapping[int, int]
 ) -> list[ChainHead]:
     """Differing heads without those of rows that an operator accepted as lost."""
     return [
@@ -717,7 +719,7 @@ def _without_accepted(
     ]
 
 
-def _differences(trail: Trail, place: str, held: list[ChainHead]) -> Iterator[Problem]:
+def _differences(trail: ExaminedTrail, place: str, held: list[ChainHead]) -> Iterator[Problem]:
     """Problems of heads that differ from the chain."""
     where = f"audit trail of {printable(trail.station)}"
     missing = [head for head in held if head.number > trail.end]
