@@ -6,15 +6,19 @@ file of a stated size is opened, and only for reading.
 
 from __future__ import annotations
 
+import glob
 import json
 import math
 import os
 import shlex
 import stat
+import time
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedReader
+from pathlib import Path
+from secrets import token_hex
 from typing import Any, Final
 
 from flasher.errors import ErrorCode, Fault, FlasherError, UsageError, printable
@@ -229,6 +233,17 @@ def _mode(path: str | os.PathLike[str]) -> int:
         raise _unreadable(printable(os.fspath(path)), problem, UsageError) from problem
     except (OSError, ValueError):
         return 0
+
+
+def part_of(path: Path, *, left_s: float = 0.0) -> Path:
+    """A new name beside `path`, for a file that then replaces it. What a killed process left under
+    such a name, and has not written to for `left_s`, is removed: 0 where a lock keeps others away.
+    """
+    for left in path.parent.glob(f".{glob.escape(path.name)}-*.part"):
+        with suppress(OSError):
+            if time.time() - left.stat().st_mtime >= left_s:
+                left.unlink()
+    return path.with_name(f".{path.name}-{token_hex(4)}.part")
 
 
 def make_private(path: str | os.PathLike[str], *, is_appended_to: bool = False) -> None:

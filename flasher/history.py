@@ -25,7 +25,7 @@ from platformdirs import user_data_path
 
 from flasher.errors import UsageError, printable
 from flasher.events import Phase
-from flasher.files import opened, owner_only
+from flasher.files import opened, owner_only, part_of
 from flasher.i18n import text
 from flasher.wording import wording_of
 
@@ -297,7 +297,7 @@ class FlashHistory:
 
     def _drop_older_half(self) -> None:
         lines = self._lines(SIZE_MAX // 2)
-        part = self.path.with_name(f".{self.path.name}-{token_hex(4)}.part")
+        part = part_of(self.path)
         try:
             with open(part, "xb", opener=owner_only) as file:
                 file.writelines(b"%s\n" % each for each in lines)

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from flasher.errors import ImageError, UsageError
-from flasher.files import opened, read
+from flasher.files import opened, part_of, read
 from flasher.protocol.spec import BMS, IMAGE_MAX_SIZE
 from flasher.settings.profile import load_profile
 
@@ -168,3 +168,18 @@ def test_the_largest_image_of_each_format_is_read_in_little_memory(
     assert digest == hashlib.sha256(data).hexdigest()
     assert int(megabytes) < 100
     path.unlink()
+
+
+def test_what_a_killed_process_left_beside_a_file_is_removed(tmp_path: Path) -> None:
+    path = tmp_path / "state[1].json"
+    left, young, other = (tmp_path / f".{name}.part" for name in
+        ("state[1].json-0a", "state[1].json-0b", "state1.json-0c"))  # fmt: skip
+    for each in (left, young, other):
+        each.touch()
+    os.utime(left, (0, 0))
+    part_of(path, left_s=3600.0).write_bytes(b"written by another process")
+    assert (left.exists(), young.exists(), other.exists()) == (False, True, True)
+    part = part_of(path)
+    assert list(tmp_path.iterdir()) == [other]
+    part.write_bytes(b"x")
+    part.replace(path)

@@ -20,7 +20,6 @@ from datetime import datetime
 from functools import cached_property
 from operator import itemgetter
 from pathlib import Path
-from secrets import token_hex
 from typing import Any, Final
 from uuid import UUID
 
@@ -28,7 +27,7 @@ from pydantic import TypeAdapter, ValidationError
 from sqlalchemy import Connection, func, select, text
 
 from flasher import __version__
-from flasher.files import read
+from flasher.files import part_of, read
 from flasher.plant.central import Central, ChainRefusedError, Refusal
 from flasher.plant.schema import OWN_PARTS, SHARED_PARTS
 from flasher.protocol.text import printable
@@ -43,6 +42,7 @@ BATCH_ROWS: Final = 200
 BATCH_BYTES: Final = 4 * 1024 * 1024
 """Traces of a batch; the first run is sent whatever its size."""
 _STATE_MAX_SIZE: Final = 64 * 1024
+_PART_AGE_S: Final = 3600.0
 _WITH_RUN: Final = (chain.CLAIMED, *chain.ENDINGS)
 _ROW: Final = ("number", "at", "event", "data", "previous_hash", "hash", "signature")
 
@@ -310,7 +310,7 @@ class Forwarder:
         """Write the state to its file, if the disk takes it: sending goes on without."""
         path = state_file(self._files.folder, self._station)
         # `flasher plant send` may write it too while the station runs.
-        part = path.with_name(f".{path.name}-{token_hex(4)}.part")
+        part = part_of(path, left_s=_PART_AGE_S)
         with suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
             try:

@@ -16,13 +16,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from secrets import token_hex
 from typing import TYPE_CHECKING
 
 from filelock import FileLock, Timeout
 
 from flasher.errors import ErrorCode, FlasherError, UsageError
-from flasher.files import make_private, parse_json, read
+from flasher.files import make_private, parse_json, part_of, read
 from flasher.i18n import text
 from flasher.protocol.text import printable
 from flasher.release.envelope import json_bytes
@@ -219,7 +218,7 @@ class TrustStore:
 
     def _write(self, path: Path, data: bytes) -> None:
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        part = path.with_name(f".{path.name}-{token_hex(4)}.part")
+        part = part_of(path)
         try:
             make_private(part)
             part.write_bytes(data)

@@ -292,6 +292,8 @@ def test_a_pipe_in_its_place_is_not_waited_for(flasher: Flasher, file: Path) -> 
 
 def test_it_stays_bounded_and_keeps_the_latest(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(history, "SIZE_MAX", 4_000)
+    file.parent.mkdir(parents=True)
+    file.with_name(f".{file.name}-0a.part").write_text("of a killed process")
     kept = FlashHistory()
     for number in range(60):
         kept.end(kept.begin(Began(**{**vars(BEGAN), "image": f"{number}.hex"})), ENDED)
