@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final, TextIO
 
 from flasher.builds import SUFFIX, is_frozen, is_whole
-from flasher.errors import InterruptedByUserError
+from flasher.errors import ErrorCode, InterruptedByUserError, UsageError
 
 _NO_WINDOW: Final = 10_000
 """Width without wrapping."""
@@ -176,6 +176,13 @@ def wrap_line(line: str, width: int) -> list[str]:
 def can_ask() -> bool:
     """True if a user can answer a question."""
     return sys.stdin.isatty() and sys.stderr.isatty()
+
+
+def check_can_ask(what: str, remedy: str = "Add --yes.") -> None:
+    """Raise UsageError if no user can answer the question that `what` needs."""
+    if not can_ask():
+        why = f"{what}, and there is no terminal to ask."
+        raise UsageError(why, remedy=remedy, code=ErrorCode.NOT_CONFIRMED)
 
 
 def agrees(question: str, *, interrupted: str) -> bool:

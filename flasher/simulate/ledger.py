@@ -22,7 +22,7 @@ from flasher.errors import ErrorCode, UsageError
 from flasher.files import JSON_MAX_SIZE, opened, parse_json
 from flasher.protocol.text import printable
 from flasher.simulate.campaign import CANARY_EVERY, Batch, Result, campaign_key
-from flasher.validation import NumberRange
+from flasher.validation import NumberRange, json_keys
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
@@ -274,15 +274,15 @@ class Ledger:
         )
 
 
+@json_keys("result missing missing_canaries")
 @dataclass(frozen=True)
 class Merged:
-    """Sum of several ledgers of a campaign."""
+    """Sum of the ledgers of a campaign."""
 
     result: Result
     missing: Sequence[Range]
-    """Seeds of the campaign that no file contains."""
-    missing_canaries: Sequence[int]
-    """First seeds of canaries that no file contains."""
+    """Seeds that no file contains: first, and the one after the last."""
+    missing_canaries: Sequence[int]  # first seeds of canaries that no file contains
     notices: Sequence[str]
 
 

@@ -10,6 +10,7 @@ import io
 import re
 import unicodedata
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from datetime import datetime
 from html.parser import HTMLParser
 from typing import Final
@@ -22,7 +23,7 @@ from flasher.i18n import text
 from flasher.protocol.text import printable
 from flasher.station.certificate import EARLIER_SHOWN, code_lines, render_certificate
 from flasher.station.records.errors import NotFoundError, UnprovenError
-from flasher.station.records.model import RunId
+from flasher.station.records.model import RunId, RunRecord
 from flasher.station.records.signatures import fingerprint, is_signed
 from flasher.station.records.store import Store
 from flasher.station.sealed import CheckedCertificate, Sealed, plain, sealed_in
@@ -73,25 +74,26 @@ def check_certificate(store: Store, data: bytes) -> CheckedCertificate:
                 )
             )
     found, remarks = _in_records(store, sealed)
-    last = life.runs[-1].run
+    moment = f"{made_at:%Y-%m-%d %H:%M} UTC"
+    run, problems = life.runs[-1].run, [*problems, *found]
+    return _checked(run, problems, sealed.station, sealed.key, moment, remarks)
+
+
+def _checked(
+    run: RunRecord,
+    problems: Iterable[str],
+    station: str,
+    key: str,
+    made_at: str = "",
+    remarks: tuple[str, ...] = (),
+) -> CheckedCertificate:
+    shown = "none"
+    with suppress(ValueError):
+        shown = fingerprint(key)
     return CheckedCertificate(
-        last.serial,
-        last.part,
-        last.state,
-        int(last.run_id),
-        sealed.station,
-        _shown_key(sealed.key),
-        f"{made_at:%Y-%m-%d %H:%M} UTC",
-        (*problems, *found),
-        remarks,
-    )
-
-
-def _shown_key(key: str) -> str:
-    try:
-        return fingerprint(key)
-    except ValueError:
-        return "none"
+        run.serial, run.part, run.state, int(run.run_id), station, shown, made_at,
+        tuple(problems), remarks,
+    )  # fmt: skip
 
 
 # -- comparison with the records -------------------------------------------------------------------
@@ -108,11 +110,7 @@ def _in_records(store: Store, sealed: Sealed) -> tuple[list[str], tuple[str, ...
     problems: list[str] = []
     if head.key != sealed.key:
         problems.append(text("it is not signed with the key that the station had in these records"))
-    examined = store.examine_run(run_id)
-    problems += [
-        text("{where} in the records: {what}", where=each.where, what=each.what)
-        for each in examined.problems
-    ]
+    problems += _in_run(store, run_id)
     if problems:
         return problems, ()
     last = store.read.run(run_id)
@@ -138,6 +136,13 @@ def _in_records(store: Store, sealed: Sealed) -> tuple[list[str], tuple[str, ...
         for run in later[-1:]
     )
     return problems, remarks
+
+
+def _in_run(store: Store, run_id: RunId) -> list[str]:
+    return [
+        text("{where} in the records: {what}", where=each.where, what=each.what)
+        for each in store.examine_run(run_id).problems
+    ]
 
 
 def _check_code(store: Store, code_text: str) -> CheckedCertificate:
@@ -169,23 +174,9 @@ def _check_code(store: Store, code_text: str) -> CheckedCertificate:
         ]
         if not is_signed(head.hash, head.signature, head.key):
             problems.append(text("the signature in the records is not that of the station's key"))
-    examined = store.examine_run(run_id)
-    problems += [
-        text("{where} in the records: {what}", where=each.where, what=each.what)
-        for each in examined.problems
-    ]
-    run = details.run
-    return CheckedCertificate(
-        run.serial,
-        run.part,
-        run.state,
-        int(run.run_id),
-        head.station if head else "",
-        _shown_key(head.key) if head else "none",
-        "",
-        tuple(problems),
-        (),
-    )
+    problems += _in_run(store, run_id)
+    station, key = (head.station, head.key) if head else ("", "")
+    return _checked(details.run, problems, station, key)
 
 
 # -- the page --------------------------------------------------------------------------------------

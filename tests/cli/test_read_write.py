@@ -30,7 +30,7 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
     """A terminal to ask on; write the answer into it."""
     typed = io.StringIO()
     monkeypatch.setattr(sys, "stdin", typed)
-    monkeypatch.setattr("flasher.cli.look.write.can_ask", lambda: True)
+    monkeypatch.setattr("flasher.cli.terminal.can_ask", lambda: True)
     return typed
 
 

@@ -240,7 +240,7 @@ def test_a_trace_with_everything_in_it_is_as_described(
 def test_a_refused_write_says_that_nothing_was_written(
     flasher: Flasher, schema: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("flasher.cli.look.write.can_ask", lambda: True)
+    monkeypatch.setattr("flasher.cli.terminal.can_ask", lambda: True)
     monkeypatch.setattr("flasher.cli.look.write.agrees", lambda _question, **_: False)
     run = flasher("write", "user-string-1", "x", *MOCK, "--json")
     hold_output(schema, run.out, 130)

@@ -228,7 +228,7 @@ def test_a_device_on_a_bus_is_not_worn_without_being_asked_for(
     assert "Add --yes." in ran.err
     asked = []
     where = "flasher.cli.bench.conformance_bench"
-    monkeypatch.setattr(f"{where}.can_ask", lambda: True)
+    monkeypatch.setattr("flasher.cli.terminal.can_ask", lambda: True)
     monkeypatch.setattr(f"{where}.agrees", lambda question, **_: asked.append(question))
     assert flasher("conformance", "explore", *bench, "--steps", "12").code == 2
     assert flasher("conformance", "explore", *bench, "--for", "60").code == 2

@@ -13,7 +13,7 @@ from flasher.cli.framework import option, option_set
 from flasher.cli.options import Bus, allow_implausible_option, target_option
 from flasher.cli.output import Output
 from flasher.cli.stop import Stop, stop_on_signal
-from flasher.cli.terminal import agrees, can_ask
+from flasher.cli.terminal import agrees, check_can_ask
 from flasher.conformance.bench_options import BenchOptions, check_bench, open_bench
 from flasher.conformance.real import HOST_UNCERTAINTY_S, DevicePowerCommand, ReadbackCommand
 from flasher.errors import ErrorCode, UsageError
@@ -64,12 +64,7 @@ def confirm_wear(wear: str, *, is_agreed: bool) -> None:
     """
     if is_agreed:
         return
-    if not can_ask():
-        raise UsageError(
-            f"{wear}, and there is no terminal to ask.",
-            remedy="Add --yes.",
-            code=ErrorCode.NOT_CONFIRMED,
-        )
+    check_can_ask(wear)
     if not agrees(f"{wear}. Begin?", interrupted="nothing was sent to the device."):
         raise UsageError(
             "Nothing was sent to the device.",

@@ -42,7 +42,7 @@ from flasher.simulate.campaign import (
     share,
     without_log,
 )
-from flasher.simulate.ledger import Ledger
+from flasher.simulate.ledger import Ledger, Merged
 from flasher.simulate.ledger import merge as merge_ledgers
 from flasher.simulate.oracle import Violation
 from flasher.simulate.plan import Plan, Subject
@@ -452,16 +452,6 @@ def _check_device(plan: Plan, subject: str | None) -> None:
         )
 
 
-@dataclass(frozen=True)
-class MergedCampaign:
-    """Sum of the ledgers of a campaign."""
-
-    result: Result
-    missing: Sequence[tuple[int, int]]
-    """Seeds that no file contains: first, and the one after the last."""
-    missing_canaries: Sequence[int]
-
-
 @simulate.action("merge", exit_codes=(ExitCode.PARTIAL,))
 @argument(
     "files", nargs=-1, required=True, type=values.FilePath("jsonl", gives=Path), metavar="FILE..."
@@ -485,8 +475,7 @@ def merge(output: Output, *, files: tuple[Path, ...], html: Path | None) -> int:
     if merged.missing or merged.missing_canaries:
         code = ExitCode.PARTIAL
     _write_page(html, merged.result, code, output, missing=missing)
-    document = MergedCampaign(merged.result, merged.missing, merged.missing_canaries)
-    return output.document(document, exit_code=code)
+    return output.document(merged, exit_code=code)
 
 
 @dataclass(frozen=True)
@@ -545,4 +534,4 @@ def _progress(bar: Bar, count: int) -> Callable[[int, int], None]:
     return lambda runs, _violations: bar.move_to(runs, count)
 
 
-DOCUMENTS: Final = (Result, Verdict, MergedCampaign, Sweep)
+DOCUMENTS: Final = (Result, Verdict, Merged, Sweep)

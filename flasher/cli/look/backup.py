@@ -27,7 +27,7 @@ from flasher.cli.look.memory import intel_hex, read_with_bar
 from flasher.cli.options import Bus, bus_options, profile_option, target_option
 from flasher.cli.output import Output, byte_count
 from flasher.cli.recording import RecordingOptions, recorded_device, recording_options
-from flasher.cli.terminal import agrees, can_ask
+from flasher.cli.terminal import agrees, check_can_ask
 from flasher.errors import ErrorCode, ExitCode, UsageError, VerificationError
 from flasher.files import parse_json, read
 from flasher.host.query import READ_MEMORY
@@ -251,12 +251,8 @@ def restore(
     target, settings = _settings_of_file(file, bus)
     bus = bus.with_profile(profile)
     chosen = load_profile(profile, target, bus.dialect)
-    if not yes and not can_ask():
-        raise UsageError(
-            "Writing settings needs a confirmation, and there is no terminal to ask.",
-            remedy="Add --yes.",
-            code=ErrorCode.NOT_CONFIRMED,
-        )
+    if not yes:
+        check_can_ask("Writing settings needs a confirmation")
     node = target.node.name
     if not yes and not agrees(
         f"Write the settings of {printable(str(file))} to the {node}?",

@@ -15,8 +15,8 @@ from flasher.cli.options import Bus, bus_options, target_option
 from flasher.cli.output import Output
 from flasher.cli.recording import RecordingOptions, recorded_connection, recording_options
 from flasher.cli.stop import stop_on_signal
-from flasher.cli.terminal import agrees, can_ask
-from flasher.errors import ErrorCode, ExitCode, UsageError
+from flasher.cli.terminal import agrees, check_can_ask
+from flasher.errors import ExitCode, UsageError
 from flasher.host.items import writable
 from flasher.host.write import FieldChange, WriteResult, field_changes, plan_write
 from flasher.protocol.fields import label
@@ -121,12 +121,8 @@ def write(
     if item is None:
         raise UsageError("Name an item to write.", remedy="See flasher write --list.")
     plan = plan_write(item, list(value), target, dialect=bus.dialect, manufacturer=manufacturer)
-    if not yes and not can_ask():
-        raise UsageError(
-            f"Writing {plan.writable.name} needs a confirmation, and there is no terminal to ask.",
-            remedy="Add --yes.",
-            code=ErrorCode.NOT_CONFIRMED,
-        )
+    if not yes:
+        check_can_ask(f"Writing {plan.writable.name} needs a confirmation")
     bus = choose_adapter(bus, output)
     with recorded_connection(recorded, bus, output, target) as (connection, record):
         device = connection.device(target, dialect=bus.dialect, taps=record.taps)

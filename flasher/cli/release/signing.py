@@ -14,8 +14,8 @@ import click
 
 from flasher.cli import values
 from flasher.cli.framework import Decorator, option, option_set
-from flasher.cli.terminal import can_ask
-from flasher.errors import ErrorCode, InterruptedByUserError, UsageError
+from flasher.cli.terminal import check_can_ask
+from flasher.errors import InterruptedByUserError, UsageError
 from flasher.protocol.text import printable
 from flasher.release.keys import SigningKey, open_key
 
@@ -91,12 +91,7 @@ def _of_descriptor(number: int) -> str:
 
 
 def _ask(question: str) -> str:
-    if not can_ask():
-        raise UsageError(
-            "A passphrase is needed, and there is no terminal to ask.",
-            remedy="Use --passphrase-env or --passphrase-fd.",
-            code=ErrorCode.NOT_CONFIRMED,
-        )
+    check_can_ask("A passphrase is needed", "Use --passphrase-env or --passphrase-fd.")
     try:
         return getpass.getpass(question)
     except (KeyboardInterrupt, EOFError) as error:

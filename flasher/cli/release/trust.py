@@ -23,7 +23,7 @@ from flasher.cli.release.signing import (
     passphrase_options,
     today,
 )
-from flasher.cli.terminal import agrees, can_ask
+from flasher.cli.terminal import agrees, check_can_ask
 from flasher.errors import ErrorCode, ExitCode, UsageError, did_you_mean
 from flasher.files import read
 from flasher.protocol.spec import TARGETS
@@ -552,11 +552,10 @@ def install(output: Output, *, file: str, replaces: bool, yes: bool) -> int:
         output.progress(f"the keys of {printable(chain.newest.name)}:")
         for line in _role_lines(chain.newest):
             output.progress(f"  {line}")
-        if not yes and not can_ask():
-            raise UsageError(
-                "Trusting these keys needs a confirmation, and there is no terminal to ask.",
-                remedy="Compare their ids with those that the maker gave you, then add --yes.",
-                code=ErrorCode.NOT_CONFIRMED,
+        if not yes:
+            check_can_ask(
+                "Trusting these keys needs a confirmation",
+                "Compare their ids with those that the maker gave you, then add --yes.",
             )
         if not yes and not agrees("Trust these keys?", interrupted="nothing was changed"):
             output.progress("nothing was changed")
