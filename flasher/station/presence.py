@@ -7,7 +7,7 @@ the socket is idle; the answer may contain the serial number. Others are not det
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, Protocol
+from typing import Final
 
 from flasher.protocol import catalogue
 from flasher.protocol.fields import Content
@@ -19,7 +19,7 @@ from flasher.protocol.messages import (
     RequestTransfer,
     decode,
 )
-from flasher.protocol.spec import COMMAND_SIZE, HEADER, Command, Mode, Target, data_size
+from flasher.protocol.spec import COMMAND_SIZE, HEADER, Command, Mode, data_size
 from flasher.protocol.text import printable
 from flasher.protocol.wire import Message, Reassembler, encode, split
 from flasher.settings.profile import Profile, sent_ids
@@ -50,24 +50,15 @@ _RECURRENCES: Final = 2
 """Units that are exchanged one after another make equal pauses once, but hardly this often."""
 
 
-class Watched(Protocol):
-    """A target with its profile."""
-
-    @property
-    def target(self) -> Target: ...
-    @property
-    def profile(self) -> Profile: ...
-
-
 class TargetWatcher:
     """Driver tap that records a device's announcements, frames and version answers."""
 
-    def __init__(self, loaded: Watched) -> None:
-        timings = loaded.profile.timings
+    def __init__(self, profile: Profile) -> None:
+        timings, target = profile.timings, profile.target
         limit_s = timings.inter_frame_timeout_s
-        self._boot = Reassembler(loaded.target.answer_id, limit_s)
-        self._own_ids = frozenset(sent_ids(loaded.target))
-        self.request = loaded.profile.upgrade_options().version_request_for(loaded.target)
+        self._boot = Reassembler(target.answer_id, limit_s)
+        self._own_ids = frozenset(sent_ids(target))
+        self.request = profile.upgrade_options().version_request_for(target)
         """Version request for this target; None if unknown."""
         item = None if self.request is None else self.request.answer_item
         self._item = item
@@ -228,8 +219,8 @@ class TargetWatcher:
 class Presence:
     """Presence of a unit on an idle bus, without I/O: frames and times are arguments."""
 
-    def __init__(self, targets: Sequence[Watched]) -> None:
-        self._targets = targets
+    def __init__(self, profiles: Sequence[Profile]) -> None:
+        self._profiles = profiles
         self._probed_at: float | None = None
         self._number = 0
         """Number of the last change."""
@@ -268,7 +259,7 @@ class Presence:
         self._forget_unit()
 
     def _forget_unit(self) -> None:
-        self.watchers = [TargetWatcher(each) for each in self._targets]
+        self.watchers = [TargetWatcher(each) for each in self._profiles]
         """A watcher for each target of the present unit."""
         self._reported_serial: str | None = None
         self._reported_power_ups = 0

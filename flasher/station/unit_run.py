@@ -104,7 +104,7 @@ class UnitRun:
         self._cancelled = cancelled
         may_restart = recipe.recipe.after_restart is AfterRestart.CONTINUE
         blind_s = BLIND_S * connection.clock.speed
-        watchers = watchers or [TargetWatcher(each) for each in recipe.targets]
+        watchers = watchers or [TargetWatcher(each.profile) for each in recipe.targets]
         self._continuity = {
             each.name: Continuity(
                 each,

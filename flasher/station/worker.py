@@ -210,7 +210,7 @@ class Worker:
         self._connection = connection
         self._virtual = virtual
         self._power: PowerControl | None = PowerCommand(setup.power) if setup.power else virtual
-        self._presence = Presence(recipe.targets)
+        self._presence = Presence([each.profile for each in recipe.targets])
         self._listened_at = connection.clock.now()
         self._is_down = False
         """True while the adapter has failed."""

@@ -14,7 +14,7 @@ from flasher.i18n import text
 from flasher.station.presence import TargetWatcher
 from flasher.web.bench import BenchController
 from flasher.web.bench_state import Activity, Compared
-from flasher.web.unit_watch import UnitWatch, WatchedTarget
+from flasher.web.unit_watch import UnitWatch
 
 _LOG: Final = logging.getLogger("flasher.web")
 
@@ -36,7 +36,7 @@ def compare(bench: BenchController) -> None:
             bench.show(compared_bytes=event.read_bytes)
 
     profile = bench.backend.profile(target)
-    unit = TargetWatcher(WatchedTarget(target, profile))
+    unit = TargetWatcher(profile)
     bench.show(doing=Activity.COMPARING, compared=None, compared_bytes=0)
     with bench.connected() as connection:
         bench.check_same_bike(bench.state.battery)
@@ -68,8 +68,7 @@ def watch_compared(bench: BenchController) -> None:
 
     try:
         with bench.connected() as connection:
-            watched = WatchedTarget(target, bench.backend.profile(target))
-            unit = UnitWatch([watched], connection.clock.speed)
+            unit = UnitWatch([bench.backend.profile(target)], connection.clock.speed)
 
             def is_another(_now: float) -> bool:
                 if compared.serial is None:  # it was silent

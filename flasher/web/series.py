@@ -30,7 +30,7 @@ from flasher.protocol.spec import BMS
 from flasher.station.presence import PROBE_S
 from flasher.web.bench import BenchController
 from flasher.web.bench_state import Activity, Done, Offer, Series, SeriesStep
-from flasher.web.unit_watch import UnitWatch, WatchedTarget
+from flasher.web.unit_watch import UnitWatch
 
 SHOWN_S: Final = 10
 """Time for which unit and image are shown before an upgrade starts."""
@@ -204,7 +204,7 @@ class _SeriesRun:
         """Watch for units on a connection that was just opened."""
         if self._watch is None:
             targets = dict.fromkeys((BMS, self._target))
-            profiles = [WatchedTarget(each, self._bench.backend.profile(each)) for each in targets]
+            profiles = [self._bench.backend.profile(each) for each in targets]
             self._watch = UnitWatch(profiles, speed)
         was_gone = self._watch.was_gone
         self._watch.start_over()

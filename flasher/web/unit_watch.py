@@ -8,25 +8,15 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from math import inf
 from typing import Final
 
 from flasher.protocol.frame import Frame
-from flasher.protocol.spec import Target
 from flasher.settings.profile import Profile
 from flasher.station.messages import PresenceChanged
 from flasher.station.presence import BLIND_S, Presence
 
 _TURN_S: Final = 0.1
-
-
-@dataclass(frozen=True)
-class WatchedTarget:
-    """A target with its profile."""
-
-    target: Target
-    profile: Profile
 
 
 class UnitWatch:
@@ -35,8 +25,8 @@ class UnitWatch:
     `speed`: seconds of the connection's clock per real second.
     """
 
-    def __init__(self, watched: Sequence[WatchedTarget], speed: float) -> None:
-        self._watched = watched
+    def __init__(self, profiles: Sequence[Profile], speed: float) -> None:
+        self._profiles = profiles
         self._blind_s = BLIND_S * speed if speed else inf
         self._frames: deque[Frame] = deque()
         self._is_enough: Callable[[float], bool] = lambda _now: True
@@ -47,7 +37,7 @@ class UnitWatch:
 
     def start_over(self) -> None:
         """Forget everything: the bus was not observed."""
-        self._presence = Presence(self._watched)
+        self._presence = Presence(self._profiles)
         self._frames.clear()
         self._listened_at = None
         self.is_there: bool | None = None

@@ -31,7 +31,7 @@ class Watched:
 
     def __init__(self, folder: Path, **known: bool) -> None:
         loaded = UnitBench(folder).recipe.targets[0]
-        self.watcher = TargetWatcher(loaded)
+        self.watcher = TargetWatcher(loaded.profile)
         self.continuity = Continuity(loaded, self.watcher, blind_s=BLIND_S, **known)
         self.now = 1.0
 

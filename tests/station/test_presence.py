@@ -25,7 +25,7 @@ TRAFFIC = Frame(0x720, b"\x55\xaa\x0c\x12\x10\x10\x00\x00")
 @pytest.fixture
 def presence(tmp_path: Path) -> Presence:
     bench = UnitBench(tmp_path)
-    return Presence(bench.recipe.targets)
+    return Presence([each.profile for each in bench.recipe.targets])
 
 
 def test_nothing_is_said_before_it_is_known(presence: Presence) -> None:
@@ -123,11 +123,8 @@ def test_a_version_answer_says_which_unit_it_is(presence: Presence) -> None:
 
 def test_a_unit_that_cannot_be_asked_is_said_to_be_unseen(tmp_path: Path) -> None:
     bench = UnitBench(tmp_path)
-    loaded = bench.recipe.targets[0]
-    profile = replace(loaded.profile, target=WMC, version_query=None)
-    firmware = loaded.firmware.model_copy(update={"target": "wmc"})
-    target = replace(loaded, firmware=firmware, profile=profile)
-    assert not Presence([target]).sees_units
+    profile = replace(bench.recipe.targets[0].profile, target=WMC, version_query=None)
+    assert not Presence([profile]).sees_units
 
 
 # -- power-ups ------------------------------------------------------------------------------------
@@ -183,7 +180,7 @@ def hear(presence: Presence, frames: list[Frame], now: float) -> PresenceChanged
 def test_a_unit_that_only_announced_itself_and_has_an_application_now_is_another_one(
     tmp_path: Path, announced_s: float
 ) -> None:
-    presence = Presence(UnitBench(tmp_path).recipe.targets)
+    presence = Presence([UnitBench(tmp_path).recipe.targets[0].profile])
     announce(presence, *(1.0 + 0.05 * at for at in range(round(announced_s / 0.05) + 1)))
     change = hear(presence, version_answer(""), 1.2 + announced_s)
     assert change is not None
@@ -287,7 +284,7 @@ def test_announcements_long_after_a_stall_are_of_one_unit(presence: Presence) ->
 def test_a_bootloader_that_goes_on_announcing_powers_up_once(
     tmp_path: Path, cadence_s: float
 ) -> None:
-    presence = Presence(UnitBench(tmp_path).recipe.targets)
+    presence = Presence([UnitBench(tmp_path).recipe.targets[0].profile])
     times = [1.0 + cadence_s * at for at in range(20)]
     changes = announce(presence, *times)
     assert changes[0] == (True, True)
@@ -309,7 +306,7 @@ def bursts(count: int, pause_s: float, announcements: int = 4) -> list[float]:
 def test_units_that_are_exchanged_at_equal_intervals_are_no_bootloader_with_pauses(
     tmp_path: Path, pause_s: float, announcements: int
 ) -> None:
-    presence = Presence(UnitBench(tmp_path).recipe.targets)
+    presence = Presence([UnitBench(tmp_path).recipe.targets[0].profile])
     changes = announce(presence, *bursts(3, pause_s, announcements))
     assert changes == [(True, True)] * 3
 
@@ -318,7 +315,7 @@ def test_units_that_are_exchanged_at_equal_intervals_are_no_bootloader_with_paus
 def test_a_bootloader_that_announces_itself_in_bursts_is_one_unit_in_the_end(
     tmp_path: Path, pause_s: float
 ) -> None:
-    presence = Presence(UnitBench(tmp_path).recipe.targets)
+    presence = Presence([UnitBench(tmp_path).recipe.targets[0].profile])
     times = bursts(20, pause_s)
     assert announce(presence, *times) == [(True, True)] * 3
     assert announce(presence, times[-1] + 1.25 * pause_s) == [(True, True)], "another one"
@@ -332,7 +329,7 @@ def test_a_pause_in_which_an_application_has_sent_is_no_pace(presence: Presence)
 
 
 def test_a_pause_that_is_a_silence_is_no_pace(tmp_path: Path) -> None:
-    watcher = TargetWatcher(UnitBench(tmp_path).recipe.targets[0])
+    watcher = TargetWatcher(UnitBench(tmp_path).recipe.targets[0].profile)
     for now in bursts(5, 4.0, 1):
         for frame in split(BMS.answer_id, encode(BootVersion("BMS", "V1.0.0").to_message(0x725))):
             watcher(frame, sent=False, now=now)

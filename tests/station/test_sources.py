@@ -83,7 +83,9 @@ class Floor:
 
     def __post_init__(self) -> None:
         self.units: dict[str, Unit] = {}
-        self.presences = {name: Presence(self.recipe.targets) for name in self.names}
+        self.presences = {
+            name: Presence([each.profile for each in self.recipe.targets]) for name in self.names
+        }
         self.line = Line([Socket(name) for name in self.names], check_serial, operator="jo")
         self.busy: dict[str, str] = {}
         for name in self.names:

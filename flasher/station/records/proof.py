@@ -9,7 +9,7 @@ import hashlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from math import inf
-from typing import Final, NamedTuple
+from typing import Final
 
 from flasher.host.options import firmware_version
 from flasher.protocol import catalogue, messages
@@ -112,13 +112,6 @@ class Restarts:
             self.uncaused.append(at_s)
 
 
-class _Usual(NamedTuple):
-    """A target without product settings: the records do not store them."""
-
-    target: Target
-    profile: Profile
-
-
 @dataclass
 class TraceOfTarget:
     """Requests and answers of one target in a trace."""
@@ -146,7 +139,7 @@ class TraceOfTarget:
     """Values that the tool wrote to identity fields."""
 
     def __post_init__(self) -> None:
-        self._watcher = TargetWatcher(_Usual(self.target, Profile(self.target)))
+        self._watcher = TargetWatcher(Profile(self.target))  # records store no settings of it
 
     def watch(self, frame: Frame, at_s: float, gap_s: float) -> None:
         """Process any frame before the unit is identified. `gap_s` is the time since the last
