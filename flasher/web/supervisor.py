@@ -356,8 +356,9 @@ class SupervisorPages:
     def yields(self, question: Question) -> Answer:
         chosen, span = self._figured(question)
         translate = translator(question.language)
-        yields, whole = self.overview.yields(chosen, list(spans_of(span)))
-        rows = [each for each in yields if each.units]
+        spans = list(spans_of(span))
+        yields, whole = self.overview.yields(chosen, spans)
+        rows = [(at, each) for at, each in zip(spans, yields, strict=True) if each.units]
         by = By(question.fields["by"]) if question.fields.get("by") in set(By) else By.SOCKET
         groups, causes = self._causes(chosen, span, by, translate)
         return self._page(
@@ -369,10 +370,10 @@ class SupervisorPages:
             whole=whole,
             chart=lines(
                 translate(text("Yield over time")),
-                [_name_of(row.span).removeprefix(f"{span.end.astimezone():%Y-}") for row in rows],
+                [_name_of(at).removeprefix(f"{span.end.astimezone():%Y-}") for at, _ in rows],
                 {
-                    "end": [100 * (row.share or 0) for row in rows],
-                    "first": [100 * (row.first_share or 0) for row in rows],
+                    "end": [100 * (each.share or 0) for _, each in rows],
+                    "first": [100 * (each.first_share or 0) for _, each in rows],
                 },
                 " %",
             )

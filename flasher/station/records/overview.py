@@ -8,7 +8,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
 from itertools import chain as joined
@@ -98,27 +98,6 @@ class Span:
 
     begin: datetime
     end: datetime
-
-
-@dataclass(frozen=True)
-class SpanYield:
-    """Yield of a period: units with a verdict, without golden units."""
-
-    span: Span
-    units: int = 0
-    passed: int = 0
-    """Number of units whose last run with a verdict is a PASS."""
-    first_passed: int = 0
-
-    @property
-    def share(self) -> float | None:
-        """Yield: units that passed in their last run, from 0 to 1; None without units."""
-        return self.passed / self.units if self.units else None
-
-    @property
-    def first_share(self) -> float | None:
-        """First-pass yield, from 0 to 1; None without units."""
-        return self.first_passed / self.units if self.units else None
 
 
 class By(StrEnum):
@@ -266,8 +245,8 @@ class Overview:
 
     # -- figures over time ------------------------------------------------------------------------
 
-    def yields(self, chosen: RunFilter, spans: Sequence[Span]) -> tuple[list[SpanYield], SpanYield]:
-        """Yield of each of these consecutive spans, and of the whole period."""
+    def yields(self, chosen: RunFilter, spans: Sequence[Span]) -> tuple[list[Units], Units]:
+        """Units of each of these consecutive spans, and of the whole period."""
         whole = Span(spans[0].begin, spans[-1].end)
         found: dict[int, Units] | None = None
         with self._rollup.rolled(chosen) as rolled:
@@ -277,11 +256,8 @@ class Overview:
         if found is None:
             found = self._units(chosen, spans)
             found[ALL_SPANS] = self._units(chosen, [whole]).get(0, Units())
-
-        def of(span: Span, place: int) -> SpanYield:
-            return SpanYield(span, **asdict(found.get(place, Units())))
-
-        return [of(span, place) for place, span in enumerate(spans)], of(whole, ALL_SPANS)
+        in_spans = [found.get(place, Units()) for place in range(len(spans))]
+        return in_spans, found.get(ALL_SPANS, Units())
 
     def _units(self, chosen: RunFilter, spans: Sequence[Span]) -> dict[int, Units]:
         run = schema.run.c

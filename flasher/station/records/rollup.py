@@ -163,6 +163,16 @@ class Units:
     passed: int = 0
     first_passed: int = 0
 
+    @property
+    def share(self) -> float | None:
+        """Yield, from 0 to 1; None without units."""
+        return self.passed / self.units if self.units else None
+
+    @property
+    def first_share(self) -> float | None:
+        """First-pass yield, from 0 to 1; None without units."""
+        return self.first_passed / self.units if self.units else None
+
 
 class Rollup:
     """File with the daily sums of a database of records."""
