@@ -6,7 +6,7 @@ Limits everything that grows with a run; the template `conformance.html` does th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Any, Final
 
 from flasher.conformance.matrix import ClauseRow
 from flasher.conformance.reports import group_title
@@ -14,13 +14,12 @@ from flasher.conformance.results import (
     CaseResult,
     CaseText,
     CaseVerdict,
-    Check,
     CheckOutcome,
     RunReport,
     Times,
 )
 from flasher.conformance.side_by_side import SideBySide
-from flasher.conformance.trace_excerpt import Excerpt, excerpt, frame_lines
+from flasher.conformance.trace_excerpt import excerpt, frame_lines
 from flasher.report import chart
 from flasher.report.base import Status, render_page
 
@@ -61,37 +60,13 @@ _CHECK_COLOURS: Final = {
 """Colours of outcomes, in the order in which checks are listed."""
 
 
-class CaseView(NamedTuple):
-    """A result with its case, prepared for the template."""
-
-    text: CaseText
-    result: CaseResult
-    title: str
-    status: Status
-    replay: str
-    checks: Sequence[tuple[Check, Status]]
-    infos: Sequence[str]
-    trace: Excerpt
-    raw: str
-    """Raw frames of a case that did not pass in full."""
-    in_part: bool
-
-
-class TimesView(NamedTuple):
-    """All measurements of one name."""
-
-    times: Times
-    histograms: dict[str, chart.HistogramChart]
-    """One drawing for each width; empty without a histogram."""
-
-
 def html_page(report: RunReport) -> str:
     groups = {
         f"{group} {group_title(group)}": [_case(text, result) for text, result in members]
         for group, members in report.by_group().items()
     }
     others = {
-        title: [case for case in cases if case.status is not Status.BAD]
+        title: [case for case in cases if case["status"] is not Status.BAD]
         for title, cases in groups.items()
     }
     return render_page(
@@ -100,7 +75,9 @@ def html_page(report: RunReport) -> str:
         status=Status.GOOD if report.ok else Status.BAD,
         word="passed" if report.ok else "not passed",
         groups=groups,
-        troubled=[case for cases in groups.values() for case in cases if case.status is Status.BAD],
+        troubled=[
+            case for cases in groups.values() for case in cases if case["status"] is Status.BAD
+        ],
         traces_open=TRACES_OPEN,
         others={title: cases for title, cases in others.items() if cases},
         times=_times(report),
@@ -129,7 +106,8 @@ def matrix_page(report: RunReport, rows: Sequence[ClauseRow]) -> str:
     )
 
 
-def _times(report: RunReport) -> Sequence[TimesView]:
+def _times(report: RunReport) -> list[tuple[Times, dict[str, chart.HistogramChart]]]:
+    """All measurements of each name, with a drawing for each width; none for too few values."""
     views = []
     measured = report.measured()
     for found in report.times:
@@ -138,11 +116,12 @@ def _times(report: RunReport) -> Sequence[TimesView]:
         if found.count >= HISTOGRAM_LEAST and is_spread:
             values_s = [one.value_s for one in measured[found.name]]
             drawings = {width: chart.histogram(values_s, at) for width, at in chart.WIDTHS.items()}
-        views.append(TimesView(found, drawings))
+        views.append((found, drawings))
     return views
 
 
-def _case(text: CaseText, result: CaseResult) -> CaseView:
+def _case(text: CaseText, result: CaseResult) -> dict[str, Any]:
+    """A result with its case, prepared for the template."""
     colour = _COLOURS[result.verdict]
     is_wrong = colour is not Status.GOOD
     trace = excerpt(
@@ -153,15 +132,16 @@ def _case(text: CaseText, result: CaseResult) -> CaseView:
     repeat = f" (repeat {result.repeat})" if result.repeat > 1 else ""
     order = list(_CHECK_COLOURS)
     checks = sorted(result.checks, key=lambda check: order.index(check.outcome))
-    return CaseView(
-        text,
-        result,
-        title=text.title + repeat,
-        status=colour,
-        replay=result.replay if colour in (Status.BAD, Status.WARNING) else "",
-        checks=[(check, _CHECK_COLOURS[check.outcome]) for check in checks[:CHECKS_SHOWN]],
-        infos=result.infos[:_INFOS_SHOWN],
-        trace=trace,
-        raw="" if result.verdict is CaseVerdict.PASS else "\n".join(frame_lines(trace.frames)),
-        in_part=result.verdict is CaseVerdict.PASS_IN_PART,
-    )
+    is_pass = result.verdict is CaseVerdict.PASS
+    return {
+        "text": text,
+        "result": result,
+        "title": text.title + repeat,
+        "status": colour,
+        "replay": result.replay if colour in (Status.BAD, Status.WARNING) else "",
+        "checks": [(check, _CHECK_COLOURS[check.outcome]) for check in checks[:CHECKS_SHOWN]],
+        "infos": result.infos[:_INFOS_SHOWN],
+        "trace": trace,
+        "raw": "" if is_pass else "\n".join(frame_lines(trace.frames)),
+        "in_part": result.verdict is CaseVerdict.PASS_IN_PART,
+    }

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Final, NamedTuple
 
@@ -76,13 +75,6 @@ class SpreadRow(NamedTuple):
     drawings: dict[str, chart.Spread] | None
 
 
-class LatencyView(NamedTuple):
-    """Chart of the answer times in an attempt."""
-
-    attempt: int
-    drawings: Drawings
-
-
 class _Limits(NamedTuple):
     """Limits for each upgrade on the page."""
 
@@ -97,24 +89,6 @@ class _Limits(NamedTuple):
             return cls(sequence.ITEMS_SHOWN, ATTEMPTS_DRAWN, PACKETS_SHOWN)
         items = max(_ITEMS_LEAST, sequence.ITEMS_SHOWN // count)
         return cls(items, 1, PACKETS_SHOWN // count)
-
-
-@dataclass(frozen=True)
-class UpgradeView:
-    """Template data of an upgrade."""
-
-    story: UpgradeStory
-    status: Status
-    word: str
-    phases: tuple[PhaseRow, ...]
-    sequence: dict[str, list[sequence.Part]]
-    latencies: tuple[LatencyView, ...]
-    spreads: tuple[SpreadRow, ...]
-    histogram: dict[str, chart.HistogramChart] | None
-    """Answer times of packets sent once; None for too few."""
-    troubled: tuple[PacketStory, ...]
-    troubled_count: int
-    remarks: tuple[str, ...]
 
 
 def render(story: Story) -> str:
@@ -162,24 +136,25 @@ def _wall_text(seconds: float | None) -> str:
         return ""
 
 
-def _view(upgrade: UpgradeStory, limits: _Limits, translate: Translator) -> UpgradeView:
+def _view(upgrade: UpgradeStory, limits: _Limits, translate: Translator) -> dict[str, Any]:
+    """Create the template data of an upgrade."""
     status = status_of(upgrade.verdict.cause)
     troubled = [each for each in upgrade.packets if not each.is_clean or each.answered_at_s is None]
     more = len(upgrade.remarks) - REMARKS_SHOWN
     remarks = upgrade.remarks[:REMARKS_SHOWN]
-    return UpgradeView(
-        story=upgrade,
-        status=status,
-        word=_WORDS[status],
-        phases=tuple(_phases(upgrade)),
-        sequence=_diagrams(upgrade.steps, upgrade.target, limits.items, translate),
-        latencies=tuple(_latencies(upgrade.packets, limits.attempts)),
-        spreads=tuple(_spreads(upgrade)),
-        histogram=_histogram(upgrade.packets),
-        troubled=tuple(troubled[: limits.packets]),
-        troubled_count=len(troubled),
-        remarks=(*remarks, f"{more:,} more remarks") if more > 0 else remarks,
-    )
+    return {
+        "story": upgrade,
+        "status": status,
+        "word": _WORDS[status],
+        "phases": list(_phases(upgrade)),
+        "sequence": _diagrams(upgrade.steps, upgrade.target, limits.items, translate),
+        "latencies": list(_latencies(upgrade.packets, limits.attempts)),
+        "spreads": list(_spreads(upgrade)),
+        "histogram": _histogram(upgrade.packets),
+        "troubled": troubled[: limits.packets],
+        "troubled_count": len(troubled),
+        "remarks": (*remarks, f"{more:,} more remarks") if more > 0 else remarks,
+    }
 
 
 # -- the parts of an upgrade ----------------------------------------------------------------------
@@ -201,15 +176,15 @@ def _share(value: float) -> float:
     return min(1.0, max(0.0, value))
 
 
-def _latencies(packets: Sequence[PacketStory], most: int) -> Iterable[LatencyView]:
-    """Yield a chart for each of the last attempts with packets."""
+def _latencies(packets: Sequence[PacketStory], most: int) -> Iterable[tuple[int, Drawings]]:
+    """Yield each of the last attempts with packets, with a chart of its answer times."""
     by_attempt: dict[int, list[chart.Sample]] = {}
     for packet in packets:
         sample = chart.Sample(packet.number, packet.answer_s, packet.tries - 1, packet.naks)
         by_attempt.setdefault(packet.attempt, []).append(sample)
     for attempt, samples in list(by_attempt.items())[-most:]:
         drawings = {name: chart.latency_chart(samples, at) for name, at in chart.WIDTHS.items()}
-        yield LatencyView(attempt, drawings)
+        yield attempt, drawings
 
 
 def _histogram(packets: Iterable[PacketStory]) -> dict[str, chart.HistogramChart] | None:
