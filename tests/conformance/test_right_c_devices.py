@@ -207,6 +207,10 @@ def test_limits_may_be_longer_than_the_pause() -> None:
     # The wait for the last answer to damaged packets.
     given |= {"limits.pause_s": 1.1, "limits.ack_s": 1.5, "limits.inter_frame_s": 0.09}
     assert verdict(89, "CR-03", given) in HELD
+    given = dict(right_c_device(24).profiles["fitting"].given)
+    # What is left of a packet that lost a frame.
+    given |= {"limits.pause_s": 1.0, "limits.ack_s": 1.5}
+    assert verdict(24, "CR-02", given) in HELD
     given = dict(right_c_device(86).profiles["fitting"].given)
     # Off the bus it misses end of transfer, and restarts while complete may still come.
     given |= {"limits.complete_s": 29.0, "limits.ack_s": 0.87, "limits.inter_frame_s": 0.09}

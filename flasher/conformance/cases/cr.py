@@ -408,8 +408,11 @@ def _check_none_accepted(
 
 
 def _late_answers(bench: Bench) -> list[Received]:
-    """Messages until all damaged packets are answered, or a pause is near."""
-    return bench.collect(bench.before_pause_s(bench.waits.settle_s))
+    """Messages until all damaged packets are answered, or a pause is near; no partial message is
+    left then.
+    """
+    waits = bench.waits
+    return bench.collect(max(waits.incomplete_s, bench.before_pause_s(waits.settle_s)))
 
 
 def _require_none_accepted(bench: Bench, what: str, replies: Sequence[Received]) -> None:
