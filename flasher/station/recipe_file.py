@@ -253,7 +253,7 @@ def sha256_of(path: Path) -> str:
 # -- files of a recipe ----------------------------------------------------------------------------
 
 
-def inside(recipe_path: Path, name: str) -> Path:
+def _inside(recipe_path: Path, name: str) -> Path:
     """Path of a file in the recipe's folder. Raises ValueError for a path outside."""
     windows, posix = PureWindowsPath(name), PurePosixPath(name)
     if windows.anchor or windows.drive or posix.is_absolute() or ".." in windows.parts:
@@ -274,12 +274,12 @@ def _load_target(
     """Load a target with its files. Raises ValueError for a file outside the folder, FlasherError
     for an unusable one.
     """
-    image_path = inside(path, firmware.image)
-    manifest = inside(path, firmware.manifest or str(manifest_path(firmware.image)))
-    profile_path = inside(path, recipe.profile) if recipe.profile else None
+    image_path = _inside(path, firmware.image)
+    manifest = _inside(path, firmware.manifest or str(manifest_path(firmware.image)))
+    profile_path = _inside(path, recipe.profile) if recipe.profile else None
     signed = release_path(image_path)
     if signed is not None:
-        manifest = inside(path, os.path.relpath(signed, path.parent.resolve()))
+        manifest = _inside(path, os.path.relpath(signed, path.parent.resolve()))
         if firmware.manifest or firmware.base is not None:
             raise UsageError(
                 f"{firmware.image!a:.80} is signed with its manifest, as a whole file.",
