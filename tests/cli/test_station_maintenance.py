@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from flasher.errors import ExitCode
-from flasher.station.records.model import RunState
+from flasher.station.records.model import RELEASED_MARK, AuditEvent, RunId, RunState
 from flasher.station.records.schema import SCHEMA_VERSION
 from tests.cli.conftest import Flasher
 from tests.cli.test_schema import hold_output
@@ -109,6 +109,26 @@ def test_a_unit_whose_records_were_changed_gets_no_page(
         in both.out
     )
     assert [path.name for path in (tmp_path / "pages").iterdir()] == [f"{SERIAL}.html"]
+
+
+@pytest.mark.slow
+def test_a_run_whose_claim_the_plant_released_has_its_mark(
+    flasher: Flasher, bench: Bench, place: tuple[str, ...], tmp_path: Path, schema: dict[str, Any]
+) -> None:
+    with closing(bench.opened()) as store:
+        store.become_station()
+        store.note(AuditEvent.CLAIM_RELEASED, {}, RunId(1))
+    page = tmp_path / "page.html"
+    shown = flasher("station", "unit", SERIAL, *place, "--certificate", page)
+    assert f"  duplicates {RELEASED_MARK}" in shown.out.splitlines()
+    assert "not checked whether it has passed at another station" in page.read_text("utf-8")
+    run = flasher("station", "unit", SERIAL, *place, "--json")
+    hold_output(schema, run.out, 0)
+    assert run.document["unit"]["runs"][0]["run"]["duplicates"] == RELEASED_MARK
+    report = flasher("station", "report", *place, "--json")
+    assert [each["duplicates"] for each in report.document["runs"]] == [RELEASED_MARK, None]
+    assert flasher("station", "verify", *place, "--certificate", page).code == ExitCode.OK
+    assert flasher("station", "verify", *place).code == ExitCode.OK
 
 
 @pytest.mark.slow

@@ -305,7 +305,7 @@ def _run_lines(details: RunDetails) -> Iterator[str]:
     if run.text:
         yield f"  {printable(run.text)}"
     if run.is_unchecked:
-        yield f"  twice?    duplicates {printable(run.duplicates or '')}"
+        yield f"  duplicates {printable(run.duplicates or '')}"
     if run.reason:
         yield f"  reason:   {printable(run.reason)}"
     where = f"{run.station}, socket {run.socket}, operator {run.operator}"
