@@ -14,6 +14,7 @@ from typing import Final
 
 from flasher.errors import BusError, ErrorCode
 from flasher.protocol.frame import Frame
+from flasher.validation import json_keys
 
 
 class TroubleKind(Enum):
@@ -182,10 +183,12 @@ class ControllerState(Enum):
     UNKNOWN = "unknown"
 
 
+@json_keys("state tx_errors rx_errors error_frames unreadable")
 @dataclass(frozen=True)
 class LinkHealth:
-    """Health of a link since it was opened. Counters are None if not reported."""
+    """State of the CAN controller, as its adapter reports it."""
 
+    # Since the link was opened; counters are None if not reported.
     state: ControllerState
     tx_errors: int | None
     rx_errors: int | None
@@ -201,7 +204,7 @@ class LinkHealth:
     """No node acknowledges: frames were sent, nothing was ever received, and error frames, the
     controller state or the full transmit queue show it."""
     unreadable: int
-    """Number of inputs that were not frames, including those before the adapter was reopened."""
+    """Number of unreadable inputs from the adapter."""  # also before it was reopened
     last_unreadable: str
     """Description of the last unreadable input."""
 

@@ -25,6 +25,7 @@ Schema = dict[str, Any]
 
 
 _PUBLISHED: Final = {
+    "flasher.bus.health.LinkHealth": "HealthDocument",
     "flasher.conformance.results.CaseResult": "ResultDocument",
     "flasher.conformance.results.Histogram": "HistogramDocument",
     "flasher.conformance.results.KeyAnswer": "AnswerDocument",

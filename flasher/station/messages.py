@@ -126,7 +126,6 @@ ToWorker = Claim | WriteReply | Stop
 class AdapterReady:
     """The adapter is open. `sees_units` is False if a present unit may send nothing."""
 
-    adapter: str
     sees_units: bool
 
 

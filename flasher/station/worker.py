@@ -221,7 +221,7 @@ class Worker:
     def work(self) -> None:
         """Work until the station ends the process or has ended itself."""
         sees = self._virtual is not None or self._presence.sees_units
-        self._pipe.send(AdapterReady(self._connection.name, sees))
+        self._pipe.send(AdapterReady(sees))
         if self._virtual is not None:
             self._pipe.send(PresenceChanged(is_there=False, is_certain=True))
         while not self._pipe.is_over:
@@ -288,7 +288,7 @@ class Worker:
         if self._is_down:
             self._is_down = False
             self._restart_watching()
-            self._pipe.send(AdapterReady(self._connection.name, self._presence.sees_units))
+            self._pipe.send(AdapterReady(self._presence.sees_units))
 
     # -- a run ------------------------------------------------------------------------------------
 

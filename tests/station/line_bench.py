@@ -146,7 +146,7 @@ class LineBench:
         )
         self.station.start()
         for name in sockets:
-            self.say(name, AdapterReady("a bus", sees_units))
+            self.say(name, AdapterReady(sees_units=sees_units))
             if sees_units and are_empty:
                 self.leave(name)
 

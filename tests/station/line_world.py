@@ -250,7 +250,7 @@ class World:
         bay = self.bays[name]
         if not bay.works:
             bay.works = True
-            self.feed(name, AdapterReady("a bus", sees_units=True))
+            self.feed(name, AdapterReady(sees_units=True))
         if bay.run:
             return
         sees = self.truth(bay)

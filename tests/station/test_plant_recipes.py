@@ -97,7 +97,7 @@ class Plant:
         self.line.turn()
         self.line.turn()
         assert self.line.ports[socket] is not old
-        self.line.say(socket, AdapterReady("a bus", sees_units=True))
+        self.line.say(socket, AdapterReady(sees_units=True))
         self.line.leave(socket)
 
     def make(self, socket: str, serial: str) -> None:
@@ -322,7 +322,7 @@ def test_nothing_begins_while_the_process_is_replaced_and_a_hung_one_is_killed(
 ) -> None:
     plant.approve(plant.give(REVISION_5))
     old = plant.line.ports["A"]
-    plant.line.say("A", AdapterReady("a bus", sees_units=True))  # still sent by the old one
+    plant.line.say("A", AdapterReady(sees_units=True))  # still sent by the old one
     assert plant.line.state("A") is SocketState.STARTING
     plant.line.scan("SOCKET A")
     plant.line.scan(SERIAL)

@@ -89,7 +89,7 @@ class Floor:
         self.line = Line([Socket(name) for name in self.names], check_serial, operator="jo")
         self.busy: dict[str, str] = {}
         for name in self.names:
-            self.line.feed(name, AdapterReady("a bus", sees_units=True), self.now)
+            self.line.feed(name, AdapterReady(sees_units=True), self.now)
         self.go_on(2.5)
 
     def go_on(self, seconds: float) -> None:
@@ -134,7 +134,7 @@ class Floor:
         self.line.feed(name, AdapterDown("its process ended"), self.now)
         self.go_on(outage_s)
         self.presences[name].begin()
-        self.line.feed(name, AdapterReady("a bus", sees_units=True), self.now)
+        self.line.feed(name, AdapterReady(sees_units=True), self.now)
 
     def scan(self, text: str, source: Source = ONE) -> None:
         self.line.scan(text, self.now, source)
@@ -418,7 +418,7 @@ def test_green_does_not_come_back_to_an_empty_socket(recipe: LoadedRecipe) -> No
     floor.perform_effects()
     assert floor.state("A") is SocketState.ERROR
     floor.presences["A"].begin()
-    floor.line.feed("A", AdapterReady("a bus", sees_units=True), floor.now)
+    floor.line.feed("A", AdapterReady(sees_units=True), floor.now)
     floor.put(unit, "A")
     floor.go_on(3.0)
     assert floor.state("A") is SocketState.PASS, "it is back, and says who it is"

@@ -318,7 +318,7 @@ def test_a_process_that_dies_takes_the_waiting_label_with_it_and_no_pass(line: L
     line.bench.clock.go_on(1.5)
     line.turn()
     for socket in "AB":
-        line.say(socket, AdapterReady("a bus", sees_units=True))
+        line.say(socket, AdapterReady(sees_units=True))
     line.arrive("A", SERIAL)
     line.arrive("B")
     assert line.state("A") is SocketState.PASS
@@ -395,7 +395,7 @@ def test_a_unit_that_is_not_seen_is_run_after_a_while_where_a_person_put_it(
     line.bench.clock.go_on(4.0)
     line.turn()
     assert line.state("B") is SocketState.SCAN
-    line.say("B", AdapterReady("a bus", sees_units=True))
+    line.say("B", AdapterReady(sees_units=True))
     line.bench.clock.go_on(2.0)
     line.turn()
     assert line.state("B") is SocketState.RUNNING
@@ -707,7 +707,7 @@ def test_a_process_that_hangs_is_ended_and_started_again(line: LineBench) -> Non
     line.arrive("A")
     hanging = line.ports["A"]
     line.bench.clock.go_on(9.0)
-    line.say("B", AdapterReady("a bus", sees_units=True))
+    line.say("B", AdapterReady(sees_units=True))
     line.bench.clock.go_on(2.0)
     line.turn()
     assert hanging.killed == 1
@@ -716,7 +716,7 @@ def test_a_process_that_hangs_is_ended_and_started_again(line: LineBench) -> Non
     line.bench.clock.go_on(1.5)
     line.turn()
     assert line.ports["A"] is not hanging
-    line.say("A", AdapterReady("a bus", sees_units=True))
+    line.say("A", AdapterReady(sees_units=True))
     line.arrive("A")
     line.scan(SERIAL)
     line.scan("SOCKET A")
@@ -738,7 +738,7 @@ def test_an_unplugged_adapter_is_shown_and_comes_back(line: LineBench) -> None:
     assert line.state("A") is SocketState.ERROR
     line.scan("SOCKET A")
     assert line.last(ScanRefused).code == "SOCKET_BROKEN"
-    line.say("A", AdapterReady("a bus", sees_units=True))
+    line.say("A", AdapterReady(sees_units=True))
     assert line.state("A") is SocketState.STARTING, "what is in it now is not known yet"
     line.leave("A")
     assert line.state("A") is SocketState.EMPTY
@@ -763,7 +763,7 @@ def test_a_new_process_does_not_take_a_finished_unit_for_a_new_one(line: LineBen
     line.turn()
     line.bench.clock.go_on(1.5)
     line.turn()
-    line.say("A", AdapterReady("a bus", sees_units=True))
+    line.say("A", AdapterReady(sees_units=True))
     line.arrive("A", SERIAL)
     assert line.state("A") is SocketState.PASS
     assert len(line.of(UnitArrived)) == 1

@@ -10,16 +10,15 @@ import contextlib
 import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from flasher import api
 from flasher.bus.detect import SLOW, Detection, DetectionResult
-from flasher.bus.health import ControllerState, HealthKeeper
+from flasher.bus.health import ControllerState, HealthKeeper, LinkHealth
 from flasher.bus.link import Clock, Link, MonotonicClock
 from flasher.cli import values
 from flasher.cli.adapters import use_only_adapter
-from flasher.cli.documents import document_of
 from flasher.cli.framework import command, option
 from flasher.cli.look import findings, throughput
 from flasher.cli.look.findings import Finding, ListenResult, Severity, TrafficCounter
@@ -69,18 +68,6 @@ class AdapterDocument:
 
 
 @dataclass(frozen=True)
-class HealthDocument:
-    """State of the CAN controller, as its adapter reports it."""
-
-    state: ControllerState
-    tx_errors: int | None
-    rx_errors: int | None
-    error_frames: int
-    unreadable: int
-    """Number of unreadable inputs from the adapter."""
-
-
-@dataclass(frozen=True)
 class TrafficDocument:
     """Traffic received while listening."""
 
@@ -102,7 +89,7 @@ class DoctorDocument:
     findings: list[Finding]
     adapters: list[AdapterDocument]
     bitrate_bps: int
-    health: HealthDocument | None
+    health: LinkHealth | None
     """State of the controller; null if no adapter was opened, like `traffic`."""
     traffic: TrafficDocument | None
     throughput: Throughput | None
@@ -179,7 +166,7 @@ def _document(examination: Diagnostics) -> DoctorDocument:
         bitrate_bps=examination.bitrate_bps,
         health=None
         if heard is None
-        else document_of(HealthDocument, heard.health, error_frames=heard.traffic.error_frames),
+        else replace(heard.health, error_frames=heard.traffic.error_frames),
         traffic=None
         if heard is None
         else TrafficDocument(

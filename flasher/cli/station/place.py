@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import getpass
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from flasher.cli.station.commands import DEFAULT_RECORDS, RecordsOptions
 from flasher.errors import UsageError
@@ -32,25 +31,17 @@ class RecordsPlace:
     station: str | None
     """Name of the station, if the options include a station file."""
 
-    def open(
-        self,
-        station: str,
-        *,
-        create: bool = True,
-        read_only: bool = False,
-        report: Callable[[str], None] = lambda _text: None,
-        kind: type[Store] = Store,
-    ) -> Store:
-        """Open the records as a station. Raises UsageError, RecordError."""
+    def open(self, station: str, *, kind: type[Store] = Store, **options: Any) -> Store:
+        """Open the records as a station; `options` as in `Store.open`. Raises UsageError,
+        RecordError.
+        """
         return kind.open(
             self.url,
             station=station,
             folder=self.files,
             lock_timeout_s=self.lock_timeout_s,
-            create=create,
-            read_only=read_only,
             key_locations=self.key_locations,
-            report=report,
+            **options,
         )
 
 
