@@ -8,11 +8,11 @@ notified when each was accepted. Waiting is a blocking receive with a deadline.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Final, Protocol
+from typing import Final
 
 from flasher import events
 from flasher.bus.link import AT_ONCE, Clock, Link
-from flasher.protocol.engine import Engine
+from flasher.protocol.engine import Engine, Tap
 from flasher.protocol.frame import Frame
 
 MAX_WAIT_S: Final = 0.1
@@ -23,14 +23,6 @@ for an ACK (R12)."""
 _CATCH_UP_FRAMES: Final = 10_000
 """Maximum number of frames received before a due `tick`: a babbling bus must not stop the
 timers."""
-
-
-class Tap(Protocol):
-    """Observer of every frame in both directions."""
-
-    def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
-        """Process a frame; `now` is on the driver's clock."""
-        ...
 
 
 def drive(

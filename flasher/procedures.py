@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, TypedDict
 from flasher import events
 from flasher.bus.health import LinkHealth, TroubleKind, bus_off_error
 from flasher.bus.link import SEND_LIMIT_S, Clock, Link
-from flasher.driver import Tap, drive
+from flasher.driver import drive
 from flasher.errors import (
     BusError,
     ErrorCode,
@@ -56,7 +56,7 @@ from flasher.image.sample import is_sample, sample_error
 from flasher.log import log_event
 from flasher.protocol.catalogue import BY_KEY, Item
 from flasher.protocol.contents import Memory, Reset, VersionInformation
-from flasher.protocol.engine import Engine
+from flasher.protocol.engine import Engine, Tap
 from flasher.protocol.fields import Content
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WELLING, Command, Dialect, Target

@@ -30,7 +30,6 @@ from flasher.cli.options import Bus
 from flasher.cli.output import Output
 from flasher.cli.stop import Stop, stop_on_signal
 from flasher.cli.values import TRACE_SUFFIXES, FilePath, FolderPath
-from flasher.driver import Tap
 from flasher.errors import (
     ErrorCode,
     ExitCode,
@@ -41,6 +40,7 @@ from flasher.errors import (
 )
 from flasher.events import TwoDevicesSeen
 from flasher.host.event_text import warning_text
+from flasher.protocol.engine import Tap
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
 from flasher.settings.profile import Profile

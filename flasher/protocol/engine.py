@@ -18,6 +18,14 @@ DROP_MARGIN: Final = 1.5
 """Silence after an abandoned message, as a multiple of the receiver's inter-frame timeout (R12)."""
 
 
+class Tap(Protocol):
+    """Observer of every frame in both directions."""
+
+    def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
+        """Process a frame; `now` is on the driver's clock."""
+        ...
+
+
 class Engine(Protocol):
     """Interface between a protocol engine, host or device, and the driver loop."""
 

@@ -12,7 +12,6 @@ from contextlib import suppress
 from typing import Final
 
 from flasher.api import Connection
-from flasher.driver import Tap
 from flasher.errors import (
     BusError,
     FlasherError,
@@ -21,6 +20,7 @@ from flasher.errors import (
     VerificationError,
     WrongDeviceError,
 )
+from flasher.protocol.engine import Tap
 from flasher.station import codes
 from flasher.station.continuity import Continuity
 from flasher.station.events import OperatorPrompted, Progressed, StepEnded, StepStarted

@@ -9,7 +9,6 @@ from typing import Final
 
 from flasher.api import Connection, prepare
 from flasher.bus.link import AT_ONCE
-from flasher.driver import Tap
 from flasher.errors import ErrorCode, InterruptedByUserError, NoAnswerError
 from flasher.host.identify import identify
 from flasher.host.identity import DeviceAnswers
@@ -18,7 +17,7 @@ from flasher.host.query import Request
 from flasher.host.runner import Runner, Stage
 from flasher.protocol.catalogue import BY_KEY
 from flasher.protocol.contents import Reset
-from flasher.protocol.engine import Engine
+from flasher.protocol.engine import Engine, Tap
 from flasher.protocol.fields import Content
 from flasher.protocol.spec import Command
 from flasher.station import codes

@@ -9,8 +9,9 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
+from flasher.protocol.engine import Tap
 from flasher.protocol.frame import Frame
 
 RING_FRAMES: Final = 20_000
@@ -60,18 +61,12 @@ class FlightRecorder:
         return self._entries[-1] if self._entries else None
 
 
-class _Tap(Protocol):
-    """Same as `flasher.driver.Tap`."""
-
-    def __call__(self, frame: Frame, *, sent: bool, now: float) -> None: ...
-
-
 class EchoFilter:
     """Driver's tap that hides an adapter's echoes from other taps, so that a trace shows each sent
     frame once. `taps` is called at each frame: more may be added later.
     """
 
-    def __init__(self, taps: Callable[[], Sequence[_Tap]]) -> None:
+    def __init__(self, taps: Callable[[], Sequence[Tap]]) -> None:
         self._taps = taps
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:

@@ -19,7 +19,6 @@ from typing import Final, TypeVar
 from flasher import events
 from flasher.api import Connection, DeviceInfo, Job, prepare, refusal
 from flasher.bike import SetImage, check_same_battery, open_bike_set, serial_number
-from flasher.driver import Tap
 from flasher.errors import (
     ErrorCode,
     FlasherError,
@@ -44,6 +43,7 @@ from flasher.image.sample import is_sample, sample_error
 from flasher.kept_settings import settings_of
 from flasher.procedures import nothing_received_error
 from flasher.protocol.contents import RunningInformation, VersionInformation
+from flasher.protocol.engine import Tap
 from flasher.protocol.spec import BMS, TARGETS, Target
 from flasher.protocol.text import printable
 from flasher.release.places import SUFFIX as RELEASE_SUFFIX

@@ -9,10 +9,10 @@ from pathlib import Path
 from flasher.api import Connection
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import Disturbance, SimulatedBus
-from flasher.driver import Tap
 from flasher.mock.faults import FaultInjector
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
+from flasher.protocol.engine import Tap
 from flasher.protocol.spec import BMS, WELLING, Target
 from flasher.station.events import StepEnded
 from flasher.station.messages import JournalError, JournalWrite, RunEvent

@@ -9,8 +9,8 @@ import pytest
 
 from flasher import events
 from flasher.api import DeviceInfo, Job
-from flasher.driver import Tap
 from flasher.errors import BusError, ErrorCode
+from flasher.protocol.engine import Tap
 from flasher.protocol.spec import BMS, Target
 from flasher.web.bench import BenchController
 from flasher.web.bench_backend import UpgradeEnding

@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 from flasher import events
-from flasher.driver import Tap
 from flasher.errors import BusError, ErrorCode, WrongDeviceError
 from flasher.mock.faults import AtTime, PowerCut
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.procedures import DeviceInfo
+from flasher.protocol.engine import Tap
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WELLING, Target
 from flasher.web.bench import BenchController

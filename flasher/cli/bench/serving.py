@@ -9,11 +9,11 @@ from flasher import events
 from flasher.api import Connection
 from flasher.cli.documents import to_json
 from flasher.cli.output import Output, byte_count
-from flasher.driver import Tap, drive
+from flasher.driver import drive
 from flasher.errors import BusError, FlasherError, UsageError, printable
 from flasher.log import BY_DEVICE, log_event
 from flasher.mock.table import BootloaderState
-from flasher.protocol.engine import Engine
+from flasher.protocol.engine import Engine, Tap
 from flasher.wording import wording_of
 
 _REOPEN_S: Final = 0.25
