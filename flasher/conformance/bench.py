@@ -205,7 +205,9 @@ class Bench:
             if reply.kind is Reply.REQUEST:
                 self.measure(TimeName.REQUEST, reply.at - sent.left_at)
                 # The request may have waited for NAKs of update commands before it.
-                self.continued_at = max(sent.left_at, reply.at - self.limit("ack_s"))
+                pause_s, ack_s = self.limit("pause_s"), self.limit("ack_s")
+                late_s = min(ack_s, pause_s - self.waits.in_transfer_s(pause_s))
+                self.continued_at = max(sent.left_at, reply.at - late_s)
                 return reply
         return None
 

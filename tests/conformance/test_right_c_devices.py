@@ -211,6 +211,10 @@ def test_limits_may_be_longer_than_the_pause() -> None:
     # What is left of a packet that lost a frame.
     given |= {"limits.pause_s": 1.0, "limits.ack_s": 1.5}
     assert verdict(24, "CR-02", given) in HELD
+    given = dict(right_c_device(73).profiles["fitting"].given)
+    # The wait for the answer to a packet that is damaged right after request transfer.
+    given |= {"limits.pause_s": 1.7, "limits.ack_s": 1.5}
+    assert verdict(73, "CR-02", given) in HELD
     given = dict(right_c_device(86).profiles["fitting"].given)
     # Off the bus it misses end of transfer, and restarts while complete may still come.
     given |= {"limits.complete_s": 29.0, "limits.ack_s": 0.87, "limits.inter_frame_s": 0.09}
