@@ -390,19 +390,7 @@ def test_units_are_printed_while_they_are_read(
         assert cut.out.splitlines() == whole.out.splitlines()[:3]
 
 
-def test_a_process_that_is_killed_is_replaced(plant: Plant, sender: Sender) -> None:
-    sender.bench.make()
-    sender.end()
-    url, path = plant.url("flasher_line_2"), str(sender.bench.path)
-    before = set(multiprocessing.active_children())
-    with sending(Sending(url, "line-2", path, None)):
-        first = _appeared(before)
-        first.kill()
-        assert _appeared(before | {first}).pid != first.pid
-        wait_until(lambda: plant.rows("SELECT count(*) FROM run") == [(1,)])
-
-
-def test_a_computer_that_cannot_start_the_process_now_starts_it_later(
+def test_a_process_that_cannot_start_now_or_is_killed_is_started_again(
     plant: Plant, sender: Sender, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sender.bench.make()
@@ -415,9 +403,13 @@ def test_a_computer_that_cannot_start_the_process_now_starts_it_later(
         usual(process)
 
     monkeypatch.setattr(SpawnProcess, "start", start)
+    before = set(multiprocessing.active_children())
     with sending(Sending(plant.url("flasher_line_2"), "line-2", str(sender.bench.path), None)):
+        first = _appeared(before)
+        assert not failures
+        first.kill()
+        assert _appeared(before | {first}).pid != first.pid
         wait_until(lambda: plant.rows("SELECT count(*) FROM run") == [(1,)])
-    assert not failures
 
 
 def wait_until(is_so: Callable[[], bool], limit_s: float = 60.0) -> None:
