@@ -127,7 +127,11 @@ def test_a_worker_of_other_code_that_joins_is_closed() -> None:
     other_code(plugin)
     with (
         LocalCluster(
-            n_workers=0, threads_per_worker=1, dashboard_address=":0", silence_logs=100
+            n_workers=0,
+            threads_per_worker=1,
+            processes=False,
+            dashboard_address=":0",
+            silence_logs=100,
         ) as made,
         Client(made, set_as_default=False) as client,
     ):
@@ -141,7 +145,11 @@ def test_a_worker_of_other_code_that_joins_is_closed() -> None:
 
 def test_a_cluster_that_ends_is_reported() -> None:
     with LocalCluster(
-        n_workers=1, threads_per_worker=1, dashboard_address=":0", silence_logs=100
+        n_workers=1,
+        threads_per_worker=1,
+        processes=False,
+        dashboard_address=":0",
+        silence_logs=100,
     ) as made:
 
         def end(_batch: Batch, _result: Result) -> None:
