@@ -133,7 +133,7 @@ def test_drawn_plans_have_the_bootloader_as_their_only_device() -> None:
 @pytest.mark.slow
 def test_random_plans_end_in_no_violation_with_a_right_bootloader() -> None:
     with bench_of(RIGHT) as bench:
-        for seed in range(500, 525):
+        for seed in range(500, 506):
             verdict = play(bench.drawn(seed), bench=bench)
             assert verdict.violations == (), verdict
 
@@ -185,7 +185,8 @@ def test_a_violation_is_shrunk_and_replayed_by_its_line(
 ) -> None:
     monkeypatch.setattr(campaign, "CANARY_RUNS", 60)
     subject = "tests.simulate.wrong_bootloaders:TrustsTheRecord"
-    assert main(["simulate", "--subject", subject, "--runs", "100"]) == ExitCode.PARTIAL
+    some = ["--seed", "30", "--runs", "1"]  # which finds it
+    assert main(["simulate", "--subject", subject, *some]) == ExitCode.PARTIAL
     line = next(each for each in capsys.readouterr().out.splitlines() if "replay: " in each)
     head, _, plan = line.partition(f"flasher simulate replay --subject {subject} ")
     assert head.endswith("replay: ")
