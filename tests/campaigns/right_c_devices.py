@@ -319,7 +319,7 @@ def _build(choices: Choices, boot_version: str, *, is_library: bool) -> Path:
     macros = [f"-D{name}={value}" for name, value in choices.items()]
     macros.append(f'-DBOOT_VERSION="{boot_version}"')
     sources = [*sorted(_SOURCES.glob("*.c")), _DUT / "flasher_dut_process.c"]
-    command = ["cc", "-std=c11", "-O1", "-Wall", "-Wextra", f"-I{_DUT}", *macros]
+    command = ["cc", "-std=c11", "-O0", "-Wall", "-Wextra", f"-I{_DUT}", *macros]
     if is_library:
         sources.append(_IN_PROCESS)
         wrapped = ",".join(f"--wrap={name}" for name in CALLS)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import pytest
+
+from flasher.conformance import init
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import CASES, Case, Requirement, Selection
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, device_maker, profile_of_mock
-from flasher.conformance.profile import ConformanceProfile
+from flasher.conformance.profile import ConformanceProfile, Value
 from flasher.conformance.results import CaseResult, CaseVerdict, RunReport
 from flasher.conformance.runner import RunObserver, SuiteOptions, run
+from flasher.conformance.subject import Subject
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
@@ -117,7 +121,7 @@ class Log(RunObserver):
 def run_case(
     action: Callable[[Bench], None],
     *,
-    device: MockSubject | None = None,
+    device: Subject | None = None,
     profile: ConformanceProfile = PROFILE,
     requires: frozenset[Requirement] = frozenset(),
     limit_s: float = 300.0,
@@ -147,6 +151,21 @@ def run_case(
         )
     finally:
         del CASES["FR-00"]
+
+
+def answers(
+    subject: Subject, wanted: Collection[str], given: Mapping[str, Value]
+) -> dict[str, Value | None]:
+    """What `init` finds for these keys by their own questions alone; `given` answers the others."""
+    start = {key: value for key, value in given.items() if key not in wanted}
+    if "device.largest_image_bytes" in wanted:  # it would know the most that could be
+        start.pop("device.application_bytes", None)
+    asked = [each for each in init.QUESTIONS if not {*wanted}.isdisjoint(each[1])]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(init, "QUESTIONS", asked)
+        found = init.ask_device(subject, ConformanceProfile(start))
+    assert found.stopped == ""
+    return {one.key: one.value for one in found.answers if one.key in wanted}
 
 
 def status_of(action: Callable[[Bench], None]) -> CaseVerdict:
