@@ -15,8 +15,6 @@ from flasher.conformance.wire import MEMORY_BYTES, Received, Reply, packet_count
 
 PACKET_TRIES: Final = 5
 END_TRIES: Final = 3
-REJECTED: Final = "the image was rejected"
-RESTARTED: Final = "the device restarted without the image"
 ATTEMPTS: Final = 3
 _QUERY_PERIOD_S: Final = 0.2
 """Interval at which the tool repeats a query (4.3)."""
@@ -231,24 +229,21 @@ class PatientHost:
         return self.deliver_end(image)
 
     def deliver_end(self, image: bytes) -> UpgradeResult:
-        """Send end of transfer until a final answer or a restart, or until the application reports
-        the version of `image`.
+        """Send end of transfer until a final answer, or until the application reports the version
+        of `image`.
         """
-        refusals, reason = 0, "no final answer"
+        refusals = 0
         for _ in range(END_TRIES):
             self._tester.send(self._encoder.end())
-            reply = self._tester.wait_for(Reply.COMPLETE, Reply.NAK, Reply.BOOT_VERSION)
+            reply = self._tester.wait_for(Reply.COMPLETE, Reply.NAK)
             if reply is not None and reply.kind is Reply.COMPLETE:
                 return UpgradeResult(ok=True)
-            if reply is not None and reply.kind is Reply.BOOT_VERSION:
-                reason = RESTARTED  # after a pause, or a completion whose answer was lost
-                break
             refusals += reply is not None
             if refusals == 2:
-                return UpgradeResult(ok=False, reason=REJECTED)
+                return UpgradeResult(ok=False, reason="the image was rejected")
         wanted = reported_version(self._encoder.target, image)
         if wanted is None or self.application_version(self._profile.limit("start_s")) != wanted:
-            return UpgradeResult(ok=False, reason=reason)
+            return UpgradeResult(ok=False, reason="no final answer")
         return UpgradeResult(ok=True)
 
     def deliver_packet(self, image: bytes, number: int, began_at: float) -> str:

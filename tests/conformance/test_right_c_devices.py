@@ -223,7 +223,7 @@ def test_limits_may_be_longer_than_the_pause() -> None:
     given |= {"limits.pause_s": 1.7, "limits.ack_s": 1.5}
     assert verdict(73, "CR-02", given) in HELD
     given = dict(right_c_device(86).profiles["fitting"].given)
-    # Off the bus it misses end of transfer, and restarts while complete may still come.
+    # Off the bus it misses end of transfer, and makes a pause while complete may still come.
     given |= {"limits.complete_s": 29.0, "limits.ack_s": 0.87, "limits.inter_frame_s": 0.09}
     assert verdict(86, "BU-02", given) in HELD
 

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, Requirement, case
-from flasher.conformance.patient_host import REJECTED, RESTARTED, is_leftover
+from flasher.conformance.patient_host import is_leftover
 from flasher.conformance.tester import FaultKind, LineFault, Sent
 from flasher.conformance.wire import (
     ACK,
@@ -30,6 +30,7 @@ _ENTRIES_MAX: Final = 60
 _ANSWER_FRAMES: Final = 2
 """General feedback, ACK and complete have two frames each."""
 _OFF_BUS_S: Final = 0.2
+_BACK_ON_BUS_S: Final = 1.1 * _OFF_BUS_S
 _POLL_S: Final = 0.0002
 """Shorter than a frame, so that an answer can be interrupted halfway."""
 _REPORTS_AT_ONCE: Final = 4
@@ -199,15 +200,13 @@ def _upgrade_disturbed(bench: Bench, make: Callable[[int], Iterator[_Disturbance
         "packet": deque(make(len(encoder.packet_of(image, 1)))),
         "end of transfer": deque(make(len(encoder.end()))),
     }
-    done = False
-    for _ in range(2 + max(map(len, left.values()))):
-        _enter(bench, image, left)
-        is_whole = _send_packets(bench, image, left) and _end(bench, image, left)
-        if is_whole:
-            bench.check_image(image)
-        done = is_whole and not any(left.values())
-        if done:
+    for _ in range(1 + max(map(len, left.values()))):
+        if not any(left.values()):
             break
+        _enter(bench, image, left)
+        if _send_packets(bench, image, left) and _end(bench, image, left):
+            bench.check_image(image)
+    done = not any(left.values())
     bench.check(done, "the upgrades are completed", "the device restarts in each one")
 
 
@@ -294,7 +293,7 @@ def _send_packets(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
 
 def _end(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
     """Send end of transfer with one fault after another until it is answered. False when the device
-    rejected the image explicitly, with two NAKs (R6), or restarted without the image.
+    rejected the image explicitly, with two NAKs (R6).
     """
     names: list[str] = []
     reply: Received | None = None
@@ -304,7 +303,8 @@ def _end(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
         disturbance = _next(left, "end of transfer")
         names.append(disturbance.name)
         with disturbance.send(bench, bench.encoder.end()):
-            left_s = max(give_up_at - bench.now, bench.waits.incomplete_s)
+            # Until no partial message is left, and it is back on the bus.
+            left_s = max(give_up_at - bench.now, bench.waits.incomplete_s, _BACK_ON_BUS_S)
             within_s = min(bench.waits.silence_s, left_s)
             reply = bench.wait_for(Reply.COMPLETE, Reply.NAK, within_s=within_s)
         if disturbance.hits_answer:
@@ -315,7 +315,7 @@ def _end(bench: Bench, image: bytes, left: _PendingFaults) -> bool:
         done = bench.host.deliver_end(image)
     if not done.ok:
         bench.info(f"{done.reason}: {'; '.join(names)}")
-    return done.reason not in (REJECTED, RESTARTED)
+    return "rejected" not in done.reason
 
 
 # -- another device -------------------------------------------------------------------------------
