@@ -12,6 +12,7 @@ from __future__ import annotations
 from binascii import Error as HexError
 from binascii import unhexlify
 from bisect import bisect_right
+from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from io import StringIO
@@ -71,7 +72,11 @@ class _Scanner:
                     "two files joined into one, or a file written over a longer one",
                 )
             if not text.isascii():
-                raise self.refuse("the line holds bytes that are not ASCII")
+                has_mark = self.line == 1 and raw.startswith((BOM_UTF8, BOM_UTF16_LE, BOM_UTF16_BE))
+                raise self.refuse(
+                    "the line holds bytes that are not ASCII",
+                    "an editor saved it as Unicode, with a byte order mark" if has_mark else "",
+                )
             yield text.decode("ascii")
         if self.line == 0:
             raise empty_error(self.source)

@@ -7,6 +7,7 @@ of its own by the profile that its answers give. What is found is a fault of the
 
 from __future__ import annotations
 
+import argparse
 import sys
 import traceback
 from functools import partial
@@ -25,6 +26,7 @@ _CHECKS: Final = (
 
 
 def main() -> int:
+    argparse.ArgumentParser(description=__doc__).parse_args()
     wrong = 0
     for check in _CHECKS:
         name = f"{check.func.__name__}{check.args[:-1] or ''}"

@@ -96,6 +96,18 @@ REFUSALS: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
 ]
 
 
+@each("encoding", ("utf-8-sig", "utf-16"))
+def test_a_file_that_an_editor_saved_as_unicode_is_refused_with_that_cause(
+    tmp_path: Path, encoding: str
+) -> None:
+    saved = tmp_path / "saved.hex"
+    saved.write_text(":0400000001020304F2\n:00000001FF\n", encoding=encoding)
+    with pytest.raises(ImageError) as caught:
+        load(saved)
+    assert "byte order mark" in caught.value.cause
+    assert caught.value.where == "line 1"
+
+
 @each("name, options, words", REFUSALS)
 def test_each_bad_file_is_refused_in_the_words_for_it(
     name: str, options: dict[str, Any], words: tuple[str, ...]
