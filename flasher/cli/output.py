@@ -169,7 +169,7 @@ class Output:
             return
         self._has_begun = True
         known = {key: value for key, value in as_json(document).items() if key != name}
-        self._write(f'{json.dumps(known)[:-1]}, "{name}": [')
+        self._write(json.dumps({**known, name: []}).removesuffix("]}"))
         try:
             for number, row in enumerate(rows):
                 self._write(f"{', ' if number else ''}{json.dumps(as_json(row))}")
