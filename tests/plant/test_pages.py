@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 
 import pytest
 
@@ -31,6 +32,11 @@ def page(pages: SupervisorPages, path: str, **fields: str) -> str:
     return pages.answer(Question(path, fields)).body.decode()
 
 
+def add_up(sums: Rollup, now: datetime) -> None:
+    while sums.add(now):
+        pass
+
+
 def test_daily_sums_take_in_the_runs_of_a_station_that_was_off_line(
     plant: Plant, sender: Sender, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -42,8 +48,8 @@ def test_daily_sums_take_in_the_runs_of_a_station_that_was_off_line(
     sender.send()
     with closing(opened(plant)) as store:
         sums = Rollup(store.database)
-        while sums.add(LATER):
-            pass
+        add_up(sums, LATER)
+        add_up(sums, LATER + rollup._ARRIVAL)
         with sums.rolled(RunFilter()) as found:
             assert found is not None
             before = found.run
@@ -52,12 +58,52 @@ def test_daily_sums_take_in_the_runs_of_a_station_that_was_off_line(
         late.close()
         monkeypatch.setattr(rollup, "_recreate", None)  # only what they touch is added
         assert store.read.figures().units == 2
-        while sums.add(LATER):
-            pass
+        add_up(sums, LATER + 2 * rollup._ARRIVAL)
+        assert store.read.figures().units == 2
+        add_up(sums, LATER + 3 * rollup._ARRIVAL)
         with sums.rolled(RunFilter()) as found:
             assert found is not None
             assert (found.run, found.all_units()) == (before, Units(2, 2, 2))
         assert store.read.figures().units == 2
+
+
+def test_daily_sums_miss_no_run_that_was_committed_after_newer_audit_rows(
+    plant: Plant, sender: Sender
+) -> None:
+    late = plant.sender("line-3")
+    for each, serial in (late, "W2605003"), (sender, SERIAL):
+        each.bench.make(serial=serial)
+        each.send()
+    late.bench.clock.go_on(50)
+    late.bench.make(serial="W2605004")
+    sender.bench.clock.go_on(100)
+    sender.bench.make(serial="W2605005")
+    with closing(opened(plant)) as store, ThreadPoolExecutor(1) as threads:
+
+        def add(minutes: int) -> None:
+            add_up(sums, LATER + timedelta(minutes=minutes))
+            assert store.read.figures().units == len(plant.rows("SELECT FROM run"))
+
+        sums = Rollup(store.database)
+        add(0)
+        add(10)
+        with plant.connect() as other:
+            other.execute("INSERT INTO unit (part, serial) VALUES ('BAT-36', 'W2605004')")
+            sending = threads.submit(late.send)  # its audit rows have their ids, and wait
+            while not plant.rows("SELECT FROM pg_locks WHERE NOT granted"):
+                pass
+            sender.send()
+            add(20)
+        sending.result()
+        late.close()
+        add(21)
+        add(30)
+        add(40)
+        with sums.rolled(RunFilter()) as found:
+            assert found is not None
+            assert found.all_units() == Units(4, 4, 4)
+            last = max(run for (run,) in plant.rows("SELECT id FROM run"))
+            assert (found.run, found._added.late) == (last, ())
 
 
 def test_units_that_passed_at_two_stations_are_shown_with_their_marks(

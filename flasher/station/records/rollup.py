@@ -2,8 +2,8 @@
 
 The sums are in a file beside the attachments and cover runs up to `Rolled.run`, without those whose
 end arrived since then. These, later runs, and days that a period covers partly, are read from the
-records. The file is rebuilt if it does not fit
-the records; nothing that is signed or verified depends on it, and it may be deleted.
+records. The file is rebuilt if it does not fit the records; nothing that is signed or verified
+depends on it, and it may be deleted.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from bisect import bisect_left, bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, time, timedelta
 from functools import partial
 from itertools import groupby
@@ -43,13 +43,15 @@ from flasher.station.records.model import (
 from flasher.station.records.rows import batches, beside_index
 
 _LOG: Final = logging.getLogger(__name__)
-_LAYOUT: Final = 3
+_LAYOUT: Final = 4
 _RUNS_AT_ONCE: Final = 5000
 _PAUSE_S: Final = 0.2
 """Pause between batches, for other programs."""
 _UNTIL_NEXT_S: Final = 600.0
 _SETTLED: Final = timedelta(hours=1)
 """Younger runs are not added: on a server, a run with a lower id may not be committed yet."""
+_ARRIVAL: Final = timedelta(minutes=10)
+"""A transaction lasts less: until then a server may commit an audit row with a lower id."""
 WITHOUT_CAUSE: Final = (RunState.PASS.value, RunState.RUNNING.value)
 _FIRST: Final = select(func.min(schema.audit.c.id))
 """A plant retires the runs of old months with their audit rows."""
@@ -209,15 +211,19 @@ class Rollup:
                 if added is None:
                     _recreate(sums)
                     added = _NOTHING
-                if added.late:
-                    has_more, until = True, added.late[-1].audit
-                    _Addition(sums, connection, added, partial(added.is_late, until=until)).add()
-                    _save_state(sums, connection, added.run, until)
-                else:
+                marks = added.marks.moved(connection, now)
+                due = [each.audit for each in added.late if each.audit <= marks.settled]
+                last, has_more = added.run, bool(due)
+                if due:
+                    chosen = partial(_ended_in, added.marks.settled, due[-1], last)
+                    marks = replace(added.marks, settled=due[-1])
+                    _Addition(sums, connection, added, chosen).add()
+                elif marks.settled:
                     last, has_more = _last_to_add(connection, added.run, now)
                     if last > added.run:
-                        _Addition(sums, connection, added, _between(added.run, last)).add()
-                        _save_state(sums, connection, last)
+                        chosen = partial(_begun_in, added.run, last, marks.settled)
+                        _Addition(sums, connection, added, chosen).add()
+                _save_state(sums, connection, last, marks)
             sums.execute("COMMIT")
         return has_more
 
@@ -286,20 +292,40 @@ class _Late(NamedTuple):
     run: int
 
 
+@dataclass(frozen=True)
+class _Marks:
+    """Audit rows up to which the ends of runs are in the sums."""
+
+    settled: int = 0
+    """Id of an audit row: none with a lower id can still be committed. The sums hold no run whose
+    end is in a later one. 0: not known yet."""
+    newest: int = 0
+    """Id of the newest audit row at the time `at`; it is settled after `_ARRIVAL`."""
+    at: str = ""
+
+    def moved(self, connection: Connection, now: datetime) -> _Marks:
+        """As of now."""
+        newest = connection.execute(select(func.max(schema.audit.c.id))).scalar_one() or 0
+        if connection.dialect.name == "sqlite":  # one program writes at a time
+            return _Marks(newest)
+        if self.at > utc_text(now):  # the clock was set back
+            return _Marks(self.settled, newest, utc_text(now))
+        if self.at > utc_text(now - _ARRIVAL):
+            return self
+        return _Marks(self.newest, newest, utc_text(now))
+
+
 class _Added(NamedTuple):
     """What the sums hold: the runs up to `run`, without those in `late`."""
 
     run: int
+    marks: _Marks
     late: tuple[_Late, ...]
     """In the order in which they arrived, the first `_RUNS_AT_ONCE`."""
 
-    def is_late(self, run_id: ColumnElement[int], until: int | None = None) -> ColumnElement[bool]:
-        """Condition of the late runs, of which there are some; up to the audit row `until`."""
-        audit = schema.audit.c
-        ends = select(audit.run_id).where(
-            audit.id >= self.late[0].audit, audit.event.in_(ENDINGS), audit.run_id <= self.run
-        )
-        return run_id.in_(ends if until is None else ends.where(audit.id <= until))
+    def is_late(self, run_id: ColumnElement[int]) -> ColumnElement[bool]:
+        """Condition of the late runs."""
+        return _ended_in(self.marks.settled, None, self.run, run_id)
 
     def holds(self, run_id: ColumnElement[int]) -> ColumnElement[bool]:
         """Condition of runs that are in the sums."""
@@ -307,26 +333,38 @@ class _Added(NamedTuple):
         return and_(is_before, not_(self.is_late(run_id))) if self.late else is_before
 
 
-_NOTHING: Final = _Added(0, ())
+_NOTHING: Final = _Added(0, _Marks(), ())
 
 
-def _between(begun: int, last: int) -> _Chosen:
-    return lambda run_id: and_(run_id > begun, run_id <= last)
+def _ended_in(
+    after: int, until: int | None, last: int, run_id: ColumnElement[int]
+) -> ColumnElement[bool]:
+    """Condition of runs up to `last` whose end is in these audit rows."""
+    audit = schema.audit.c
+    ends = select(audit.run_id).where(
+        audit.id > after, audit.event.in_(ENDINGS), audit.run_id <= last
+    )
+    return run_id.in_(ends if until is None else ends.where(audit.id <= until))
 
 
-def _save_state(
-    sums: sqlite3.Connection, connection: Connection, run: int, until: int | None = None
-) -> None:
-    """Identify the records, the last added run, and the newest audit row; `until` limits these. The
-    row differs in a restored copy of the records that continued from there.
+def _begun_in(
+    after: int, last: int, settled: int, run_id: ColumnElement[int]
+) -> ColumnElement[bool]:
+    """Condition of runs after one and up to `last`, that did not end after `settled`."""
+    return and_(run_id > after, run_id <= last, not_(_ended_in(settled, None, last, run_id)))
+
+
+def _save_state(sums: sqlite3.Connection, connection: Connection, run: int, marks: _Marks) -> None:
+    """Identify the records, the last added run, and the newest audit row. The row differs in a
+    restored copy of the records that continued from there.
     """
     audit = schema.audit.c
     newest = select(audit.id, audit.hash).order_by(audit.id.desc()).limit(1)
-    row = connection.execute(newest if until is None else newest.where(audit.id <= until)).one()
+    row = connection.execute(newest).one()
     records = connection.execute(select(schema.schema_info.c.records_id)).scalar_one()
     state = {
         "layout": _LAYOUT, "records": records, "run": run, "audit": row.id, "hash": row.hash,
-        "first": connection.execute(_FIRST).scalar_one(),
+        "first": connection.execute(_FIRST).scalar_one(), "marks": asdict(marks),
     }  # fmt: skip
     sums.execute("DELETE FROM state")
     sums.execute("INSERT INTO state VALUES (?)", (json.dumps(state),))
@@ -347,11 +385,12 @@ def _added(sums: sqlite3.Connection, connection: Connection) -> _Added | None:
     records = select(info.records_id).where(info.records_id == found["records"])
     if any(connection.execute(query).first() is None for query in (is_same, records)):
         return None
+    marks = _Marks(**found["marks"])
     late = select(audit.id, audit.run_id).where(
-        audit.id > found["audit"], audit.event.in_(ENDINGS), audit.run_id <= found["run"]
+        audit.id > marks.settled, audit.event.in_(ENDINGS), audit.run_id <= found["run"]
     )
     rows = connection.execute(late.order_by(audit.id).limit(_RUNS_AT_ONCE)).all()
-    return _Added(int(found["run"]), tuple(_Late(*row) for row in rows))
+    return _Added(int(found["run"]), marks, tuple(_Late(*row) for row in rows))
 
 
 def _recreate(sums: sqlite3.Connection) -> None:
