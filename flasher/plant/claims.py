@@ -51,6 +51,8 @@ _RENEW: Final = text("SELECT plant_renew(:tokens, :lease_s)")
 _RELEASE: Final = text("SELECT plant_release(:tokens)")
 _NOW: Final = text("SELECT clock_timestamp()")
 _CLAIMS: Final = text("SELECT * FROM plant_claims()")
+_STATES_RELEASED: Final = text("SELECT to_regprocedure('plant_released()') IS NOT NULL")
+"""False for the database of an older flasher."""
 _RELEASED: Final = text("SELECT * FROM plant_released()")
 
 
@@ -208,7 +210,8 @@ class PlantClaims:
                     central.execute(_RELEASE, {"tokens": left})
                 central.execute(_RENEW, {"tokens": kept, "lease_s": LEASE_S})
                 clocks = _compared(central, self._clock)
-                released = central.execute(_RELEASED).all()
+                states = central.execute(_STATES_RELEASED).scalar_one()
+                released = central.execute(_RELEASED).all() if states else ()
             runs = {self._recorded(each.part, each.serial).get(each.token) for each in released}
         except RecordError as error:
             with self._mutex:

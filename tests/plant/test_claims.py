@@ -546,6 +546,19 @@ def test_a_station_records_that_the_claim_of_its_run_was_released(
     assert gone.gate.take_released() == set(), "the plant knows that it knows"
 
 
+def test_a_station_claims_at_a_plant_that_does_not_yet_state_released_claims(
+    plant: Plant, lines: tuple[Line, Line]
+) -> None:
+    with plant.connect() as owner:
+        owner.execute("DROP FUNCTION plant_released")
+    lines[0].claim()
+    expire(plant)
+    lines[0].claims.tend()
+    assert refused(lines[1]).refusal is Refusal.UNIT_RUNNING, "the claim was renewed"
+    assert lines[0].asked("W2605003").unchecked == ""
+    assert lines[0].gate.take_released() == set()
+
+
 def test_a_claim_that_is_renewed_is_not_released(plant: Plant, lines: tuple[Line, Line]) -> None:
     lines[0].claim()
     with pytest.raises(UsageError, match="nothing was released"):
