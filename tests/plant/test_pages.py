@@ -5,14 +5,17 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import pytest
 
 from flasher.cli.station.records import passed_twice_lines
-from flasher.plant.store import PlantStore
+from flasher.plant.central import Central
+from flasher.plant.retire import Retirement
+from flasher.plant.store import PlantRecords, PlantStore
 from flasher.station.records import rollup
 from flasher.station.records.capability import Capability
-from flasher.station.records.model import Admission, Order, RunFilter
+from flasher.station.records.model import Admission, Order, RunFilter, RunState
 from flasher.station.records.rollup import Rollup, Units
 from flasher.web.query_processes import Question
 from flasher.web.supervisor import SupervisorPages
@@ -104,6 +107,34 @@ def test_daily_sums_miss_no_run_that_was_committed_after_newer_audit_rows(
             assert found.all_units() == Units(4, 4, 4)
             last = max(run for (run,) in plant.rows("SELECT id FROM run"))
             assert (found.run, found._added.late) == (last, ())
+
+
+def test_daily_sums_lose_the_runs_of_each_retired_month_beside_a_station_that_is_silent(
+    plant: Plant, sender: Sender
+) -> None:
+    silent = plant.sender("line-3")
+    silent.bench.make(serial="W2605009")
+    silent.send()
+    silent.close()
+    for serial in ("W2605003", "W2605004", "W2605005"):
+        sender.bench.make(RunState.FAIL)
+        sender.bench.make(serial=serial)
+        sender.bench.clock.go_on(31 * 86_400.0)
+    sender.bench.make()
+    sender.send()
+    now = datetime(2026, 12, 1, tzinfo=UTC)
+    with closing(opened(plant)) as store, closing(Central(plant.url())) as central:
+        sums, records = Rollup(store.database), PlantRecords(store.database)
+        records._rollup._file = Path("nowhere")
+        for month in ("2026-06", "2026-07"):
+            list(Retirement(central, plant.folder / "archive").retire(month))
+            assert store.read.figures() == records.figures()
+            add_up(sums, now)
+            now += rollup._ARRIVAL
+            add_up(sums, now)
+            assert store.read.figures() == records.figures()
+            with sums.rolled(RunFilter()) as found:
+                assert found is not None
 
 
 def test_units_that_passed_at_two_stations_are_shown_with_their_marks(

@@ -53,8 +53,14 @@ _SETTLED: Final = timedelta(hours=1)
 _ARRIVAL: Final = timedelta(minutes=10)
 """A transaction lasts less: until then a server may commit an audit row with a lower id."""
 WITHOUT_CAUSE: Final = (RunState.PASS.value, RunState.RUNNING.value)
-_FIRST: Final = select(func.min(schema.audit.c.id))
-"""A plant retires the runs of old months with their audit rows."""
+_FIRST: Final = select(
+    schema.station.c.id,
+    select(func.min(schema.audit.c.at))
+    .where(schema.audit.c.station_id == schema.station.c.id)
+    .scalar_subquery(),
+)
+"""The oldest audit row of each station. A plant retires the runs of old months with their audit
+rows, except for the last one of each station."""
 _TABLES: Final = """
 CREATE TABLE state (content TEXT);
 CREATE TABLE day (number INTEGER PRIMARY KEY, begin TEXT, end TEXT, month TEXT);
@@ -364,10 +370,14 @@ def _save_state(sums: sqlite3.Connection, connection: Connection, run: int, mark
     records = connection.execute(select(schema.schema_info.c.records_id)).scalar_one()
     state = {
         "layout": _LAYOUT, "records": records, "run": run, "audit": row.id, "hash": row.hash,
-        "first": connection.execute(_FIRST).scalar_one(), "marks": asdict(marks),
+        "first": _first(connection), "marks": asdict(marks),
     }  # fmt: skip
     sums.execute("DELETE FROM state")
     sums.execute("INSERT INTO state VALUES (?)", (json.dumps(state),))
+
+
+def _first(connection: Connection) -> dict[str, str]:
+    return {str(station): at for station, at in connection.execute(_FIRST) if at}
 
 
 def _added(sums: sqlite3.Connection, connection: Connection) -> _Added | None:
@@ -378,7 +388,7 @@ def _added(sums: sqlite3.Connection, connection: Connection) -> _Added | None:
     if row is None:
         return _NOTHING
     found = json.loads(row[0])
-    if found["layout"] != _LAYOUT or found["first"] != connection.execute(_FIRST).scalar_one():
+    if found["layout"] != _LAYOUT or found["first"].items() - _first(connection).items():
         return None
     audit, info = schema.audit.c, schema.schema_info.c
     is_same = select(audit.id).where(audit.id == found["audit"], audit.hash == found["hash"])
