@@ -21,7 +21,7 @@ from flasher.conformance.patient_host import UPDATES_MAX, PatientHost
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import Unsupported
 from flasher.conformance.subject import BY_BUS, SIMULATED_BUS, Subject, readback_source
-from flasher.conformance.tester import BusTester
+from flasher.conformance.tester import BusTester, Sent
 from flasher.conformance.wire import (
     MEMORY_BYTES,
     PACKET_FRAMES,
@@ -199,17 +199,23 @@ class Bench:
         for tries in range(1, UPDATES_MAX + 1):
             self.update_tries = tries
             sent = self.send(self.encoder.update(size_bytes))
-            reply = self.host.request_or_version(sent.left_at, self.limit("erase_s"))
+            reply = self.await_request(sent)
             if reply is None:
                 break
             if reply.kind is Reply.REQUEST:
                 self.measure(TimeName.REQUEST, reply.at - sent.left_at)
-                # The request may have waited for NAKs of update commands before it.
-                pause_s, ack_s = self.limit("pause_s"), self.limit("ack_s")
-                late_s = min(ack_s, pause_s - self.waits.in_transfer_s(pause_s))
-                self.continued_at = max(sent.left_at, reply.at - late_s)
                 return reply
         return None
+
+    def await_request(self, sent: Sent) -> Received | None:
+        """Wait for request transfer, with which a transfer begins, or a boot version."""
+        reply = self.host.request_or_version(sent.left_at, self.limit("erase_s"))
+        if reply is not None and reply.kind is Reply.REQUEST:
+            # The request may have waited for NAKs of update commands before it.
+            pause_s, ack_s = self.limit("pause_s"), self.limit("ack_s")
+            late_s = min(ack_s, pause_s - self.waits.in_transfer_s(pause_s))
+            self.continued_at = max(sent.left_at, reply.at - late_s)
+        return reply
 
     def update_again(self, size_bytes: int, *, may_be_whole: bool = False) -> None:
         """Get request transfer after a transfer that was broken off or refused: from the waiting
@@ -490,8 +496,7 @@ class Bench:
         it (up_08), else by `leave_transfer`, which raises Unsupported.
         """
         if self.choice("up_08") == "either" and not self.subject.has_power:
-            sent = self.send(self.encoder.update(size_bytes))
-            reply = self.host.request_or_version(sent.left_at, self.limit("erase_s"))
+            reply = self.await_request(self.send(self.encoder.update(size_bytes)))
             if reply is not None and reply.kind is Reply.REQUEST:
                 return
         if self.choice("up_08") != "starts_over":

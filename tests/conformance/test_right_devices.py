@@ -102,6 +102,12 @@ def test_bit_flips_may_be_answered_late() -> None:
 
 
 @pytest.mark.slow
+def test_damage_may_be_answered_late_where_an_update_command_began_the_transfer_anew() -> None:
+    """Without power control: the pause counts from the last request transfer."""
+    assert faults_of(2013, Selection(cases=("CR-02",)), make=strained_device) == []
+
+
+@pytest.mark.slow
 @each("case_id", ("TX-01", "TX-03", "TX-04", "TX-06", "SE-04", "EN-02", "CO-04"))
 @each("bad_packet", ("silence", "nak_received"))
 def test_the_suite_makes_no_pause_of_its_own(case_id: str, bad_packet: Any) -> None:

@@ -111,13 +111,10 @@ class Probe(PacketTransfer):
         if reset:
             bench.reset_to_bootloader()
             bench.wait_for_window()
-        sent = bench.send(frames)
-        reply = bench.host.request_or_version(sent.left_at, bench.limit("erase_s"))
+        reply = bench.await_request(bench.send(frames))
         taken = reply is not None and reply.kind is Reply.REQUEST
         bench.check(complies(wanted, taken), f"update command {wanted}", reply or "no answer")
-        if taken:
-            bench.continued_at = bench.now
-        else:
+        if not taken:
             lasts = bench.choice("up_08") == "starts_over" and not bench.is_pause_near(
                 bench.waits.settle_s
             )
