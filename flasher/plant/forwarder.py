@@ -309,10 +309,10 @@ class Forwarder:
     def _save_state(self) -> None:
         """Write the state to its file, if the disk takes it: sending goes on without."""
         path = state_file(self._files.folder, self._station)
-        # `flasher plant send` may write it too while the station runs.
-        part = part_of(path, left_s=_PART_AGE_S)
         with suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
+            # `flasher plant send` may write it too while the station runs.
+            part = part_of(path, left_s=_PART_AGE_S)
             try:
                 part.write_bytes(_STATE.dump_json(self.state))
                 part.replace(path)  # not flushed to the disk: the next attempt writes it again

@@ -227,7 +227,7 @@ class RecipeFolder:
             bundle = self._checked(digest)
         except UsageError:
             with suppress(OSError):  # so that the process that fetches reads it again
-                (self.folder / digest / _MANIFEST).touch()
+                os.utime(self.folder / digest / _MANIFEST)
             raise
         path = self.folder / digest / _FILES / bundle.recipe
         loaded = replace(load_checked(path, day, may_waive=False), digest=digest)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import gzip
 import hashlib
+import os
 import shutil
 import signal
 import time
@@ -410,6 +411,8 @@ def load_when_whole(pipe: StationPipe, setup: WorkerSetup) -> LoadedRecipe | Non
             if not is_down:
                 pipe.send(AdapterDown(error.what))
             is_down = True
+            with suppress(OSError):  # so that the process that fetches reads its files again
+                os.utime(setup.recipe)
             pipe.wait(RELOAD_S)
     return None
 

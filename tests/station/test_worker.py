@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import os
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -297,6 +298,7 @@ def test_a_damaged_copy_of_the_plants_recipe_is_reported_once_and_loaded_when_it
     file, poll = tmp_path / "bms.bin.toml", socket.channel.poll
     whole = file.read_bytes()
     file.write_bytes(whole + b"\n")
+    os.utime(socket.setup.recipe, (1, 1))
 
     def fetched_after_7_s(timeout: float = 0.0) -> bool:
         if socket.clock.now() > 7.0:
@@ -308,6 +310,8 @@ def test_a_damaged_copy_of_the_plants_recipe_is_reported_once_and_loaded_when_it
     assert loaded is not None
     assert loaded.files == socket.recipe.files
     assert socket.kinds == ["AdapterDown"]
+    changed = socket.setup.recipe.stat().st_mtime > 1
+    assert changed, "the process that fetches has to read files that a disk damaged"
     assert "is fetched again" in socket.channel.of(AdapterDown)[0].reason
     assert socket.clock.now() == pytest.approx(10.0, abs=0.2)
 
