@@ -128,13 +128,14 @@ _RELEASED: Final = f"""
 CREATE OR REPLACE FUNCTION plant_released() RETURNS TABLE (token text, part text, serial text)
 LANGUAGE sql STABLE {DEFINER} AS $$
     SELECT c.token, c.part, c.serial FROM released_claim c
-        WHERE c.station = plant_my_station() AND c.run_id IS NOT NULL AND NOT EXISTS (
+            JOIN chain_row e ON e.station = c.station AND e.run_id = c.run_id
+        WHERE c.station = plant_my_station() AND e.content IS NOT NULL AND NOT EXISTS (
             SELECT FROM chain_row o WHERE o.station = c.station AND o.run_id = c.run_id
                 AND o.event = '{AuditEvent.CLAIM_RELEASED}')
 $$
 """
 """Claims of the station that were released before the end of their run arrived, until its audit
-trail has that."""
+trail has that, or the run is retired."""
 
 _END: Final = f"""
 CREATE OR REPLACE FUNCTION plant_end_claims() RETURNS trigger LANGUAGE plpgsql {DEFINER} AS $$

@@ -23,6 +23,7 @@ from flasher.plant.claim_list import (
 )
 from flasher.plant.claims import LEASE_S, PlantClaims, _Own
 from flasher.plant.deliveries import document_of
+from flasher.plant.retire import Retirement
 from flasher.plant.setup import role_of, setup
 from flasher.station.gate import Gate
 from flasher.station.records.errors import ClaimRefusedError, Refusal
@@ -531,7 +532,7 @@ def test_a_station_records_that_the_claim_of_its_run_was_released(
 ) -> None:
     gone, _ = lines
     run = gone.end(gone.claim())
-    gone.claim("W2605003")
+    second = gone.claim("W2605003")
     expire(plant)
     assert released(plant, station="line-2") == 2
     gone.claims.tend()
@@ -544,6 +545,16 @@ def test_a_station_records_that_the_claim_of_its_run_was_released(
     gone.sender.send()
     gone.claims.tend()
     assert gone.gate.take_released() == set(), "the plant knows that it knows"
+    gone.end(second)
+    gone.sender.send()
+    gone.claims.tend()
+    assert gone.gate.take_released() == {second.run_id}
+    gone.bench.store.note(AuditEvent.CLAIM_RELEASED, {}, second.run_id)
+    gone.sender.send()
+    with closing(Central(plant.url())) as central:
+        list(Retirement(central, plant.folder / "archive").retire("2026-06"))
+    gone.claims.tend()
+    assert gone.gate.take_released() == set(), "its audit row is retired"
 
 
 def test_a_station_claims_at_a_plant_that_does_not_yet_state_released_claims(
