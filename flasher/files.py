@@ -221,6 +221,7 @@ def check_secret(path: str | os.PathLike[str], what: str) -> None:
         raise UsageError(
             f"Every user of this computer may read {what}, or change it.",
             where=printable(os.fspath(path)),
+            cause="its mode; a secret that a container mounts has to be declared with mode 0440",
             remedy="Let the user of this program, or its group, alone read it:"
             f" chmod o= {printable(shlex.quote(os.fspath(path)))}",
         )

@@ -104,8 +104,8 @@ def serial_numbers(rule: SerialNumberRule, first: int, step: int) -> Iterator[st
 
 
 def number_of_first(station: str) -> int:
-    """The number with which the virtual units of a station of a plant begin: those of stations with
-    the same recipe differ, or they would look like duplicates.
+    """The number with which the virtual units of a station of a plant begin: one of a few blocks,
+    so that those of two stations with the same recipe seldom look like duplicates.
     """
     return 1 + zlib.crc32(station.encode("utf-8")) % _BLOCKS * _BLOCK
 
