@@ -7,6 +7,7 @@ import hashlib
 import multiprocessing
 import os
 import signal
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -198,7 +199,8 @@ def _begin_process() -> None:
 def _run_each(run_one: RunBatch, pipe: Connection, run_s: float) -> None:
     """In the process: run what comes through the pipe; anything that comes meanwhile is a stop."""
     _begin_process()
-    gc.freeze()  # the modules do not become garbage: looking through them takes 5 % of a run
+    if sys.implementation.name == "cpython":
+        gc.freeze()  # the modules do not become garbage: looking through them takes 5 % of a run
     while True:
         try:
             batch: Batch | None = pipe.recv()
