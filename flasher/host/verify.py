@@ -300,17 +300,21 @@ def check_version(run: Runner[Any], plan: Plan, options: UpgradeOptions) -> Stag
 
 class _Announcements:
     """Boot versions of a device whose application is awaited: one that starts it sends a burst, one
-    without any goes on (R11, R14).
+    without any goes on (R11, R14), also in bursts. Two restarts make two bursts and then silence.
     """
 
     def __init__(self, run: Runner[Any], target: Target) -> None:
         self._run, self._answer_id = run, target.answer_id
         self._first_at, self._last_at = inf, -inf
+        self._longest_pause_s = 0.0
         run.also_listen_on(target.answer_id)
 
     @property
     def go_on(self) -> bool:
-        return self._last_at - self._first_at >= self._run.timings.announcing_on_s
+        timings = self._run.timings
+        silence_s = self._run.now - self._last_at
+        has_ended = silence_s > self._longest_pause_s + timings.burst_s
+        return not has_ended and self._last_at - self._first_at >= timings.announcing_on_s
 
     @property
     def judged_at(self) -> float:
@@ -326,8 +330,10 @@ class _Announcements:
             case Message() if came.can_id == self._answer_id and (
                 isinstance(decode(came), BootVersion)
             ):
-                self._first_at = min(self._first_at, self._run.now)
-                self._last_at = self._run.now
+                now = self._run.now
+                if self._first_at < inf:
+                    self._longest_pause_s = max(self._longest_pause_s, now - self._last_at)
+                self._first_at, self._last_at = min(self._first_at, now), now
         return came
 
 

@@ -358,6 +358,7 @@ _BURST_S = 4 * 0.05
         (4.7, 0.2, 40, Verdict.IN_BOOTLOADER),
         (0.3, 0.2, 1, Verdict.NO_ANSWER),
         (0.3, 0.2, 2, Verdict.NO_ANSWER),
+        (0.3, 0.9, 2, Verdict.NO_ANSWER),
         (4.7, 0.2, 1, Verdict.NO_ANSWER),
     ],
 )

@@ -86,6 +86,11 @@ def test_frames_that_a_killed_process_left_in_its_adapter_are_those_of_a_host() 
         # A device that restarts more slowly than the tool waits.
         "job packets=4 ; independent restart=4.999772",
         "job packets=4 ; mock reset_delay_s=5.00062",
+        # Two restarts of a device whose application answers no query: two bursts, then silence.
+        """
+        job packets=3 image=952 ; independent after_complete=restarts answers=false
+        @packet1+0.000665 restart ; @end+1.1 restart
+        """,
     ],
 )
 def test_what_only_looks_like_a_fault_is_none(line: str) -> None:
