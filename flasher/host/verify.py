@@ -276,15 +276,19 @@ def check_version(run: Runner[Any], plan: Plan, options: UpgradeOptions) -> Stag
     while True:
         query = yield from filtered(ask(run, Query(request, quiet=True)), announced.look)
         if query.answer is not None:
-            break
+            answered_at = run.now
+            if not run.is_cancelled:
+                again = yield from filtered(ask(run, Query(request, quiet=True)), announced.look)
+                yield from filtered(count_answers(run, [again]), announced.look)
+            # A device that restarted answers again; the bootloader of a second one goes on.
+            is_settled = announced.last_at <= answered_at or run.is_cancelled
+            if is_settled or run.duplicates.evidence:
+                break
         if run.is_cancelled:
             return Verification(Level.VERSION, Verdict.INTERRUPTED)
         if run.now >= max(give_up_at, announced.judged_at):
             verdict = Verdict.IN_BOOTLOADER if announced.go_on else Verdict.NO_ANSWER
             return Verification(Level.VERSION, verdict)
-    if not run.is_cancelled:
-        again = yield from ask(run, Query(request, quiet=True))
-        yield from count_answers(run, [again])
     version = firmware_version(query.answer)
     if run.duplicates.evidence:
         return Verification(Level.VERSION, Verdict.TWO_DEVICES, version, run.duplicates.evidence)
@@ -305,16 +309,16 @@ class _Announcements:
 
     def __init__(self, run: Runner[Any], target: Target) -> None:
         self._run, self._answer_id = run, target.answer_id
-        self._first_at, self._last_at = inf, -inf
+        self._first_at, self.last_at = inf, -inf
         self._longest_pause_s = 0.0
         run.also_listen_on(target.answer_id)
 
     @property
     def go_on(self) -> bool:
         timings = self._run.timings
-        silence_s = self._run.now - self._last_at
+        silence_s = self._run.now - self.last_at
         has_ended = silence_s > self._longest_pause_s + timings.burst_s
-        return not has_ended and self._last_at - self._first_at >= timings.announcing_on_s
+        return not has_ended and self.last_at - self._first_at >= timings.announcing_on_s
 
     @property
     def judged_at(self) -> float:
@@ -332,8 +336,8 @@ class _Announcements:
             ):
                 now = self._run.now
                 if self._first_at < inf:
-                    self._longest_pause_s = max(self._longest_pause_s, now - self._last_at)
-                self._first_at, self._last_at = min(self._first_at, now), now
+                    self._longest_pause_s = max(self._longest_pause_s, now - self.last_at)
+                self._first_at, self.last_at = min(self._first_at, now), now
         return came
 
 

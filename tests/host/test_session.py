@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from dataclasses import replace
+from math import inf
 
 import pytest
 
@@ -152,6 +153,8 @@ class Application:
         self.check = check
         self.now = 50.0
         self.asked: list[Content] = []
+        self.announces_at: list[float] = []
+        """Times at which a bootloader announces itself."""
         self._wire = Reassembler(BMS.request_id, 1.0)
 
     def next_question(self) -> Content | None:
@@ -159,7 +162,12 @@ class Application:
         while not self.check.done:
             wanted = self.check.deadline()
             assert wanted is not None
-            self.now = max(self.now, wanted)
+            if self.announces_at and self.announces_at[0] <= max(self.now, wanted):
+                self.now = max(self.now, self.announces_at.pop(0))
+                for piece in ANNOUNCEMENT:
+                    self.check.receive(piece, self.now)
+            else:
+                self.now = max(self.now, wanted)
             self.check.tick(self.now)
             while (frame := self.check.next_frame(self.now)) is not None:
                 self.check.frame_sent(self.now)
@@ -178,7 +186,12 @@ class Application:
             self.check.receive(frame, self.now)
 
 
+BOOT_VERSION = BootVersion("BMS", "V1.0.0").to_message(BMS.answer_id)
+ANNOUNCEMENT = split(BOOT_VERSION.can_id, encode(BOOT_VERSION))
 VERSION = (0x720, 0x1540)
+NEW_VERSION = VersionInformation(
+    *(WireText(encode_text(text, 16)) for text in ("BM36", "W1", "V1r0r0_20200101", NEW))
+)
 MEMORY = (0x725, 0x5688)
 
 
@@ -339,10 +352,9 @@ def test_an_application_that_starts_slowly_is_waited_for() -> None:
     application = Application(check)
     while application.now < 53.0:
         assert application.next_question() is not None
-    texts = [WireText(encode_text(text, 16)) for text in ("BM36", "W1", "V1r0r0_20200101", NEW)]
-    application.answer(VERSION, VersionInformation(*texts))
+    application.answer(VERSION, NEW_VERSION)
     assert application.next_question() is not None, "it is asked again, to count its answers"
-    application.answer(VERSION, VersionInformation(*texts))
+    application.answer(VERSION, NEW_VERSION)
     assert application.next_question() is None
     assert check.result.verdict is Verdict.VERSION_RIGHT
 
@@ -366,39 +378,54 @@ def test_a_bootloader_that_announces_itself_beyond_a_burst_runs_no_application(
     begins_s: float, pause_s: float, bursts: int, verdict: Verdict
 ) -> None:
     check = version_check(planned(), UpgradeOptions())
-    boot = BootVersion("BMS", "V1.0.0").to_message(BMS.answer_id)
-    frames = split(boot.can_id, encode(boot))
-    due = [
+    application = Application(check)
+    application.announces_at = [
         50.0 + begins_s + burst * (_BURST_S + pause_s) + number * 0.05
         for burst in range(bursts)
         for number in range(4)
     ]
-    application = Application(check)
     while application.next_question() is not None:
-        while due and due[0] <= application.now:
-            del due[0]
-            for frame in frames:
-                check.receive(frame, application.now)
+        pass
     assert check.result.verdict is verdict
     assert application.now < 50.0 + 8.0
 
 
 def test_an_application_that_starts_after_the_bootloader_announced_itself_late_is_right() -> None:
     check = version_check(planned(), UpgradeOptions())
-    boot = BootVersion("BMS", "V1.0.0").to_message(BMS.answer_id)
     application = Application(check)
-    has_announced = False
+    application.announces_at = [54.8]
     while application.next_question() is not None:
-        if application.now > 54.7 and not has_announced:
-            has_announced = True
-            for frame in split(boot.can_id, encode(boot)):
-                check.receive(frame, application.now)
-        elif application.now > 55.5:
-            texts = ("BM36", "W1", "V1r0r0_20200101", NEW)
-            application.answer(
-                VERSION, VersionInformation(*(WireText(encode_text(each, 16)) for each in texts))
-            )
+        if application.now > 55.5:
+            application.answer(VERSION, NEW_VERSION)
     assert check.result.verdict is Verdict.VERSION_RIGHT
+
+
+@each(
+    "restart_s, verdict, version",
+    [
+        (0.5, Verdict.VERSION_RIGHT, NEW),
+        (inf, Verdict.NO_ANSWER, None),
+    ],
+)
+def test_a_device_that_restarts_after_its_version_answer_is_asked_again(
+    restart_s: float, verdict: Verdict, version: str | None
+) -> None:
+    check = version_check(planned(), UpgradeOptions())
+    application = Application(check)
+    application.announces_at = [50.03 + number * 0.05 for number in range(4)]
+    while application.next_question() is not None:
+        if not 50.02 < application.now < 50.2 + restart_s:
+            application.answer(VERSION, NEW_VERSION)
+    assert (check.result.verdict, check.result.running_version) == (verdict, version)
+
+
+def test_a_bootloader_that_announces_itself_beside_the_new_application_is_a_second_device() -> None:
+    check = version_check(planned(), UpgradeOptions())
+    application = Application(check)
+    application.announces_at = [50.09 + number * 0.05 for number in range(40)]
+    while application.next_question() is not None:
+        application.answer(VERSION, NEW_VERSION)
+    assert check.result.verdict is Verdict.TWO_DEVICES
 
 
 @each("version, verdict", [(NEW, Verdict.INTERRUPTED), ("V1r0r0_20200101", Verdict.VERSION_OTHER)])
