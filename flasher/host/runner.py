@@ -146,6 +146,7 @@ class Runner(Generic[T]):
         if self.done:
             return
         self.now = now
+        self.tx.drop_stalled(now)  # before its refusal, which was sent during the pause
         self.duplicates.frame_received(frame, now)
         if self.watch is not None and self.watch(frame):
             return

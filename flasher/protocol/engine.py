@@ -166,15 +166,23 @@ class Transmitter:
         """Time of the next frame to send; None while the queue is empty."""
         return None if self.due_at == inf else self.due_at
 
-    def next_frame(self, now: float) -> Frame | None:
-        """Return the next frame to send; None during a gap and while the queue is empty."""
-        if now < self.due_at:
-            return None
-        if self._sent_frames and now - self._frame_sent_at > self._dropped_after_s:
+    def drop_stalled(self, now: float) -> bool:
+        """Send a partly sent message again if this computer paused in it; return True if so. The
+        receiver has dropped its first part, or refuses it (R12).
+        """
+        is_stalled = self.begun and now - self._frame_sent_at > self._dropped_after_s
+        if is_stalled:
             self._sent_frames = 0
             self.due_at = now + self._dropped_after_s * DROP_MARGIN
             if self.on_message_dropped is not None:
                 self.on_message_dropped()
+        return is_stalled
+
+    def next_frame(self, now: float) -> Frame | None:
+        """Return the next frame to send; None during a gap and while the queue is empty."""
+        if now < self.due_at:
+            return None
+        if self._sent_frames and self.drop_stalled(now):
             return None
         self._asked_at = now
         return self._queue[0].frames[self._sent_frames]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from math import inf
 from typing import Final
 
 from flasher.bus.link import SEND_LIMIT_S
@@ -19,7 +20,9 @@ DOCUMENTED: Final = frozenset(ExitCode) - {
 }  # fmt: skip
 """Exit codes that a plan can cause; the image of a plan is always one for its device."""
 LATEST: Final = 1.001
-"""Latest end as a share of the announced deadline: a message that has begun is finished."""
+"""Latest end as a share of the announced deadline."""
+_FINISH_S: Final = 0.012
+"""Time on the bus of a packet that had begun at the deadline, without gaps."""
 _BLOCKS: Final = (plans.Load, plans.Unplug, plans.BusOff)
 """Faults in which the adapter may take no frame for some time."""
 _LIES_AT_THE_END: Final = (
@@ -163,7 +166,7 @@ def judge(facts: Facts, reported: Reported) -> Iterator[Violation]:
     # An adapter that can send nothing is waited for.
     blocked_s = SEND_LIMIT_S if not facts.plan.job.others or _has(facts.plan, _BLOCKS) else 0.0
     paused_s = sum(each.seconds for each in facts.plan.clauses if isinstance(each, plans.Stall))
-    if facts.took_s > LATEST * facts.limit_s + blocked_s + paused_s:
+    if facts.took_s > LATEST * facts.limit_s + _FINISH_S + blocked_s + paused_s:
         share = facts.took_s / facts.limit_s
         yield Violation("LATE", f"ended at {share:.4f} of the announced deadline")
     if facts.interrupted_s > _INTERRUPTED_S + blocked_s + paused_s:
@@ -226,6 +229,14 @@ def _restart_s(device: plans.Device) -> float:
     return 0.0
 
 
+def _listens_s(device: plans.Device) -> float:
+    """Time in which a device listens after its last boot version, its choice."""
+    if isinstance(device, plans.Independent):
+        chosen = device.chosen()
+        return chosen.window if chosen.listens == "after_burst" else inf
+    return inf
+
+
 def _judge_failure(facts: Facts, reported: Reported) -> Iterator[Violation]:
     """Check that a run without success had a reason, and enough time."""
     plan, job = facts.plan, facts.plan.job
@@ -240,6 +251,8 @@ def _judge_failure(facts: Facts, reported: Reported) -> Iterator[Violation]:
     is_ready = device.begins == "application" and device.application == "old"
     is_ready &= not any(each in device.choices for each in _CANNOT_SUCCEED)
     is_ready &= _restart_s(device) < TIMES.boot_version_timeout_s - _BOOT_VERSION_S
+    # An update command has two frames, with a gap before each.
+    is_ready &= _listens_s(device) > TIMES.update_spacing_s + 2 * job.gap
     if is_ready and not twins and not [*plan.events]:
         yield Violation("FAILED", "no success, and nothing was disturbed")
 

@@ -109,6 +109,8 @@ class WireRules:
         self._erasures = 0
         self._is_erasing = False
         """No packet was sent since the last update command."""
+        self._requests = 0
+        """Requests for the transfer since then."""
         self._heads: dict[bytes, float] = {}
         """First frames of the host's messages, with their times."""
         self._sent_twice: set[bytes] = set()
@@ -207,7 +209,7 @@ class WireRules:
             self._break("an update command beside an application that answers (R27)")
         self._acknowledged.clear()
         self._packet = None
-        self.ends, self._is_erasing = 0, True
+        self.ends, self._requests, self._is_erasing = 0, 0, True
 
     def _check_acknowledged(self, number: int) -> None:
         if number not in self._acked:
@@ -225,6 +227,8 @@ class WireRules:
             waited_s = now - self._packet[1]
             is_early = waited_s < DEFAULT_TIMINGS.ack_timeout_s - _TOLERANCE_S
             is_answered = self._heard_at > self._packet_begun_at - REPEAT_MARGIN_S
+            # A host that paused may read the second request for it when it has sent it (R16).
+            is_answered |= number == 1 and self._requests > 1
             if is_early and self._checks_times and not is_answered:
                 self._break("a packet is sent again before its answer is late")
 
@@ -278,6 +282,7 @@ class WireRules:
                 self._break("a NAK names another packet than the device waits for")
         elif command == REQUEST:
             self._wanted = 1
+            self._requests += 1
         elif command == VERSION:
             self.has_version_answer = True
         elif command == FEEDBACK:

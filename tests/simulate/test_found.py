@@ -78,6 +78,29 @@ def test_frames_that_a_killed_process_left_in_its_adapter_are_those_of_a_host() 
 @each(
     "line",
     [
+        # Pauses cut packets, whose refusals wait in the adapter.
+        """
+        job target=wmc packets=18 gap=0.051 ; mock bad_packet=nak_received
+        @packet7+0.000125 stall seconds=1.6 ; @packet10+0.0034 stall seconds=1.5
+        @packet13+0.0034 stall seconds=1.5
+        """,
+        # An update command with gaps takes longer than the device listens.
+        """
+        job packets=10 gap=0.056 ; adapter echoes=true delay=0.000477 jitter=0.005232 seed=60055551
+        independent restart=0.220692 listens=after_burst window=0.121274
+        """,
+        # A packet that has begun is finished.
+        """
+        job timeout=3.7 gap=0.078 ; adapter echoes=true delay=0.164021 queue=2 seed=60030255
+        mock application=none window_s=0.103743 erase_time_s=0.184007 program_time_s=0.000806
+        """,
+        # A host that paused reads a second request for packet 1 when it has sent it.
+        """
+        job packets=4 ; adapter echoes=true delay=0.001482 seed=60047295
+        independent begins=boot spacing=0.0489 update_in_transfer=ignored session=2.0
+        independent begins=boot spacing=0.0489 update_in_transfer=ignored session=2.0 late=1.9e-05
+        @update stall seconds=2.970722
+        """,
         # A pause cuts packet 1, and the answer to a second update command comes meanwhile.
         """
         job packets=3 gap=0.037 ; independent restart=0.02 erase=0.07 update_again=erases store=0.25
