@@ -6,9 +6,9 @@ the image is read back.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from math import inf
 from typing import Any, Final
 
 from flasher import events
@@ -37,6 +37,7 @@ from flasher.image.plan import Plan
 from flasher.protocol.contents import Memory, ReadMemory
 from flasher.protocol.messages import BootVersion, decode
 from flasher.protocol.spec import Target
+from flasher.protocol.timing import Announcing
 from flasher.protocol.wire import Message
 from flasher.wording import wording
 
@@ -272,22 +273,25 @@ def check_version(run: Runner[Any], plan: Plan, options: UpgradeOptions) -> Stag
     if request is None:
         raise ValueError("this target has no version query")
     give_up_at = run.now + run.timings.application_start_timeout_s
-    announced = _Announcements(run, plan.target)
+    announcing = Announcing(run.timings)
+    run.also_listen_on(plan.target.answer_id)
+    look = _note_boot_versions(run, plan.target, announcing)
     while True:
-        query = yield from filtered(ask(run, Query(request, quiet=True)), announced.look)
+        query = yield from filtered(ask(run, Query(request, quiet=True)), look)
         if query.answer is not None:
             answered_at = run.now
             if not run.is_cancelled:
-                again = yield from filtered(ask(run, Query(request, quiet=True)), announced.look)
-                yield from filtered(count_answers(run, [again]), announced.look)
+                again = yield from filtered(ask(run, Query(request, quiet=True)), look)
+                yield from filtered(count_answers(run, [again]), look)
             # A device that restarted answers again; the bootloader of a second one goes on.
-            is_settled = announced.last_at <= answered_at or run.is_cancelled
+            is_settled = announcing.last_at <= answered_at or run.is_cancelled
             if is_settled or run.duplicates.evidence:
                 break
         if run.is_cancelled:
             return Verification(Level.VERSION, Verdict.INTERRUPTED)
-        if run.now >= max(give_up_at, announced.judged_at):
-            verdict = Verdict.IN_BOOTLOADER if announced.go_on else Verdict.NO_ANSWER
+        if run.now >= max(give_up_at, announcing.judged_at):
+            goes_on = announcing.goes_on(run.now)
+            verdict = Verdict.IN_BOOTLOADER if goes_on else Verdict.NO_ANSWER
             return Verification(Level.VERSION, verdict)
     version = firmware_version(query.answer)
     if run.duplicates.evidence:
@@ -302,43 +306,18 @@ def check_version(run: Runner[Any], plan: Plan, options: UpgradeOptions) -> Stag
     return Verification(Level.VERSION, verdict, version)
 
 
-class _Announcements:
-    """Boot versions of a device whose application is awaited: one that starts it sends a burst, one
-    without any goes on (R11, R14), also in bursts. Two restarts make two bursts and then silence.
-    """
+def _note_boot_versions(
+    run: Runner[Any], target: Target, announcing: Announcing
+) -> Callable[[StageInput], StageInput]:
+    """Return a function that notes boot versions among the inputs of a query."""
 
-    def __init__(self, run: Runner[Any], target: Target) -> None:
-        self._run, self._answer_id = run, target.answer_id
-        self._first_at, self.last_at = inf, -inf
-        self._longest_pause_s = 0.0
-        run.also_listen_on(target.answer_id)
-
-    @property
-    def go_on(self) -> bool:
-        timings = self._run.timings
-        silence_s = self._run.now - self.last_at
-        has_ended = silence_s > self._longest_pause_s + timings.burst_s
-        return not has_ended and self.last_at - self._first_at >= timings.announcing_on_s
-
-    @property
-    def judged_at(self) -> float:
-        """Time at which those that have begun have ended or go on; -inf without any."""
-        if self._first_at == inf:
-            return -inf
-        timings = self._run.timings
-        return self._first_at + timings.announcing_on_s + 2 * timings.burst_s
-
-    def look(self, came: StageInput) -> StageInput:
-        """Note a boot version among the inputs of a query."""
+    def look(came: StageInput) -> StageInput:
         match came:
-            case Message() if came.can_id == self._answer_id and (
-                isinstance(decode(came), BootVersion)
-            ):
-                now = self._run.now
-                if self._first_at < inf:
-                    self._longest_pause_s = max(self._longest_pause_s, now - self.last_at)
-                self._first_at, self.last_at = min(self._first_at, now), now
+            case Message(can_id=target.answer_id) if isinstance(decode(came), BootVersion):
+                announcing.note(run.now)
         return came
+
+    return look
 
 
 def check_memory(run: Runner[Any], plan: Plan, running_version: str | None) -> Stage[Verification]:

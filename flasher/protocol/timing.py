@@ -6,6 +6,7 @@ Hosts and device models take a `Timings`; a target profile replaces single value
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 from typing import Annotated
 
 from flasher.protocol.spec import BOOT_VERSION_BURST
@@ -68,3 +69,42 @@ class Timings:
 
 
 DEFAULT_TIMINGS = Timings()
+
+
+@dataclass
+class Announcing:
+    """Boot versions of a device whose application is awaited: one that starts it sends a burst, one
+    without any goes on, perhaps with pauses (R11, R14). Two restarts make two bursts, then silence.
+    """
+
+    timings: Timings = DEFAULT_TIMINGS
+    first_at: float = inf
+    last_at: float = -inf
+    """Times of the first and last boot version, in seconds."""
+    _longest_pause_s: float = 0.0
+
+    def note(self, now: float) -> None:
+        """Record a boot version."""
+        if self.first_at < inf:
+            self._longest_pause_s = max(self._longest_pause_s, now - self.last_at)
+        self.first_at, self.last_at = min(self.first_at, now), now
+
+    @property
+    def lasted_s(self) -> float:
+        """Time from the first to the last one."""
+        return max(0.0, self.last_at - self.first_at)
+
+    @property
+    def judged_at(self) -> float:
+        """Time at which those that have begun have ended or go on; -inf without any."""
+        if self.first_at == inf:
+            return -inf
+        return self.first_at + self.timings.announcing_on_s + 2 * self.timings.burst_s
+
+    def goes_on(self, now: float) -> bool:
+        """Return True if they have gone on beyond a burst, and the silence since is no longer than
+        a pause between them.
+        """
+        silence_s = now - self.last_at
+        has_ended = silence_s > self._longest_pause_s + self.timings.burst_s
+        return not has_ended and self.lasted_s >= self.timings.announcing_on_s

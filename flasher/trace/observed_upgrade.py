@@ -22,7 +22,7 @@ from flasher.protocol.spec import (
     Target,
 )
 from flasher.protocol.text import find_firmware_version
-from flasher.protocol.timing import DEFAULT_TIMINGS
+from flasher.protocol.timing import DEFAULT_TIMINGS, Announcing
 from flasher.protocol.wire import DamageReason
 from flasher.trace.decoder import BusEvent, Kind, TimedEvent
 from flasher.trace.figures import Transfer
@@ -147,8 +147,8 @@ class ObservedUpgrade:
     end_naks: int = 0
     boots_after_end: int = 0
     completed_at_s: float | None = None
-    announced_on_s: float = 0.0
-    """Time over which the bootloader announced itself after complete, in seconds."""
+    announcing: Announcing = field(default_factory=Announcing)
+    """Boot versions after complete."""
     early_complete: bool = False
     running_version: str | None = None
 
@@ -166,7 +166,6 @@ class ObservedUpgrade:
         self._by_number: dict[int, PacketStory] = {}
         self._left_s: dict[int, float] = {}
         """Time when the latest copy of each packet had left the wire, in seconds."""
-        self._boot_again_at_s: float | None = None
         self._last_boot = ""
         self._tail = b""
 
@@ -381,8 +380,7 @@ class ObservedUpgrade:
             case Phase.END | Phase.CONFIRM if self.completed_at_s is None:
                 self.boots_after_end += 1
             case Phase.END | Phase.CONFIRM:
-                self._boot_again_at_s = self._boot_again_at_s or timed.begin_s
-                self.announced_on_s = now - self._boot_again_at_s
+                self.announcing.note(now)
 
     def _request(self, timed: TimedEvent) -> None:
         if self.phase is Phase.TRANSFER and self.current is not None:

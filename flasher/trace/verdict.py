@@ -11,7 +11,6 @@ from typing import Final, NamedTuple
 
 from flasher.events import Phase
 from flasher.protocol.text import BOOT_VERSION_FORM
-from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.trace.observed_upgrade import ObservedUpgrade
 from flasher.trace.story import Cause, TraceVerdict
 from flasher.wording import explanation
@@ -70,10 +69,10 @@ def _completed(upgrade: ObservedUpgrade) -> _Found | None:
     node, running = upgrade.target.node.name, upgrade.running_version
     if upgrade.completed_at_s is None:
         return None
-    if running is None and upgrade.announced_on_s >= DEFAULT_TIMINGS.announcing_on_s:
+    if running is None and upgrade.announcing.goes_on(upgrade.last_at_s):
         text = (
             f"The {node} reported complete, then its bootloader announced itself for "
-            f"{upgrade.announced_on_s:.1f} s, and no application answered."
+            f"{upgrade.announcing.lasted_s:.1f} s, and no application answered."
         )
         return _Found(Cause.IN_BOOTLOADER, text)
     if running is None:

@@ -53,6 +53,12 @@ def unanswered(tape: Tape, times: int) -> Tape:
     return tape
 
 
+def asked(tape: Tape, times: int) -> Tape:
+    for _ in range(times):
+        tape.wait(0.2).tool(0x1540, b"", READ)
+    return tape
+
+
 def repeatedly(tape: Tape, bursts: int) -> Tape:
     for _ in range(bursts):
         tape.wait(0.2).boot().wait(0.05).boot()
@@ -79,6 +85,13 @@ CAUSES: list[tuple[str, Callable[[Tape], object], Cause, Phase | None, int | Non
         "announces itself for good after complete",
         lambda t: repeatedly(t.to_end().complete(), 8),
         Cause.IN_BOOTLOADER,
+        Phase.END,
+        None,
+    ),
+    (
+        "restarts twice after complete",
+        lambda t: asked(t.to_end().complete().wait(0.2).boot().wait(1.1).boot(), 10),
+        Cause.COMPLETED,
         Phase.END,
         None,
     ),
