@@ -272,7 +272,8 @@ def check_version(run: Runner[Any], plan: Plan, options: UpgradeOptions) -> Stag
     request = options.version_request_for(plan.target)
     if request is None:
         raise ValueError("this target has no version query")
-    give_up_at = run.now + run.timings.application_start_timeout_s
+    start_s = run.timings.application_start_timeout_s
+    give_up_at = run.now + start_s
     announcing = Announcing(run.timings)
     run.also_listen_on(plan.target.answer_id)
     look = _note_boot_versions(run, plan.target, announcing)
@@ -289,10 +290,11 @@ def check_version(run: Runner[Any], plan: Plan, options: UpgradeOptions) -> Stag
                 break
         if run.is_cancelled:
             return Verification(Level.VERSION, Verdict.INTERRUPTED)
-        if run.now >= max(give_up_at, announcing.judged_at):
-            goes_on = announcing.goes_on(run.now)
-            verdict = Verdict.IN_BOOTLOADER if goes_on else Verdict.NO_ANSWER
-            return Verification(Level.VERSION, verdict)
+        if run.now >= max(give_up_at, announcing.judged_at) and announcing.goes_on(run.now):
+            return Verification(Level.VERSION, Verdict.IN_BOOTLOADER)
+        # One that starts it through its bootloader may need as long again.
+        if run.now >= max(give_up_at, announcing.last_at + start_s):
+            return Verification(Level.VERSION, Verdict.NO_ANSWER)
     version = firmware_version(query.answer)
     if run.duplicates.evidence:
         return Verification(Level.VERSION, Verdict.TWO_DEVICES, version, run.duplicates.evidence)
@@ -309,9 +311,17 @@ def check_version(run: Runner[Any], plan: Plan, options: UpgradeOptions) -> Stag
 def _note_boot_versions(
     run: Runner[Any], target: Target, announcing: Announcing
 ) -> Callable[[StageInput], StageInput]:
-    """Return a function that notes boot versions among the inputs of a query."""
+    """Return a function that notes boot versions among the inputs of a query. It begins anew after
+    a pause of this computer: those that are read then were sent at an unknown time.
+    """
+    input_at = run.now
+    paused_s = 2 * run.timings.command_repeat_s
 
     def look(came: StageInput) -> StageInput:
+        nonlocal input_at
+        if run.now - input_at > paused_s:
+            announcing.forget()
+        input_at = run.now
         match came:
             case Message(can_id=target.answer_id) if isinstance(decode(came), BootVersion):
                 announcing.note(run.now)

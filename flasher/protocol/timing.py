@@ -89,6 +89,10 @@ class Announcing:
             self._longest_pause_s = max(self._longest_pause_s, now - self.last_at)
         self.first_at, self.last_at = min(self.first_at, now), now
 
+    def forget(self) -> None:
+        """Begin anew."""
+        self.first_at, self.last_at, self._longest_pause_s = inf, -inf, 0.0
+
     @property
     def lasted_s(self) -> float:
         """Time from the first to the last one."""

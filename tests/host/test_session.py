@@ -387,7 +387,7 @@ def test_a_bootloader_that_announces_itself_beyond_a_burst_runs_no_application(
     while application.next_question() is not None:
         pass
     assert check.result.verdict is verdict
-    assert application.now < 50.0 + 8.0
+    assert application.now < 50.0 + 10.2
 
 
 def test_an_application_that_starts_after_the_bootloader_announced_itself_late_is_right() -> None:
@@ -395,7 +395,7 @@ def test_an_application_that_starts_after_the_bootloader_announced_itself_late_i
     application = Application(check)
     application.announces_at = [54.8]
     while application.next_question() is not None:
-        if application.now > 55.5:
+        if application.now > 59.5:
             application.answer(VERSION, NEW_VERSION)
     assert check.result.verdict is Verdict.VERSION_RIGHT
 

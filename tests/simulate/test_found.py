@@ -84,6 +84,11 @@ def test_frames_that_a_killed_process_left_in_its_adapter_are_those_of_a_host() 
         @packet7+0.000125 stall seconds=1.6 ; @packet10+0.0034 stall seconds=1.5
         @packet13+0.0034 stall seconds=1.5
         """,
+        # A host that paused reads boot versions of different times at once.
+        """
+        job packets=8 gap=0.024 ; mock reset_in_transfer=restarts after_complete=restarts
+        @end+0.147118 stall seconds=6.62761 ; @packet2 power seconds=0.070656
+        """,
         # An update command with gaps takes longer than the device listens.
         """
         job packets=10 gap=0.056 ; adapter echoes=true delay=0.000477 jitter=0.005232 seed=60055551
@@ -120,6 +125,14 @@ def test_what_only_looks_like_a_fault_is_none(line: str) -> None:
     assert play(Plan.parse(line)).violations == ()
 
 
-def test_a_device_that_restarts_in_time_is_upgraded() -> None:
-    verdict = play(Plan.parse("job packets=4 ; independent restart=4.997"))
+@each(
+    "line",
+    [
+        "job packets=4 ; independent restart=4.997",
+        # Its application starts through the bootloader, 5.1 s after the final answer.
+        "job packets=4 ; independent window=0.95 after_complete=restarts start=1.97",
+    ],
+)
+def test_a_device_that_restarts_in_time_is_upgraded(line: str) -> None:
+    verdict = play(Plan.parse(line))
     assert (verdict.ending, verdict.violations) == ("completed", ())
