@@ -128,8 +128,9 @@ class Runner(Generic[T]):
     def await_second_device(self) -> Stage[bool]:
         """Wait for late answers of a second device; return True if cancelled."""
         until = self.now + SECOND_DEVICE_WAIT_S
-        came: StageInput = Signal.TIME
-        while self.now < until and came is not Signal.CANCEL:
+        came: StageInput | None = None
+        # After a pause of this computer, `TIME` follows all that was received meanwhile.
+        while came not in (Signal.TIME, Signal.CANCEL):
             came = yield until
         return came is Signal.CANCEL
 

@@ -104,7 +104,8 @@ class Survey(Runner[None]):
         self, run: Runner[None], listen_s: float, requests: Iterable[Request]
     ) -> Stage[None]:
         until = run.now + listen_s
-        while run.now < until:
+        came: StageInput | None = None
+        while came is not Signal.TIME:
             came = yield until
             self._take(came)
             if came is Signal.CANCEL:

@@ -189,9 +189,14 @@ class Application:
 BOOT_VERSION = BootVersion("BMS", "V1.0.0").to_message(BMS.answer_id)
 ANNOUNCEMENT = split(BOOT_VERSION.can_id, encode(BOOT_VERSION))
 VERSION = (0x720, 0x1540)
-NEW_VERSION = VersionInformation(
-    *(WireText(encode_text(text, 16)) for text in ("BM36", "W1", "V1r0r0_20200101", NEW))
-)
+
+
+def version(serial: str) -> VersionInformation:
+    texts = ("BM36", serial, "V1r0r0_20200101", NEW)
+    return VersionInformation(*(WireText(encode_text(each, 16)) for each in texts))
+
+
+NEW_VERSION = version("W1")
 MEMORY = (0x725, 0x5688)
 
 
@@ -417,6 +422,19 @@ def test_a_device_that_restarts_after_its_version_answer_is_asked_again(
         if not 50.02 < application.now < 50.2 + restart_s:
             application.answer(VERSION, NEW_VERSION)
     assert (check.result.verdict, check.result.running_version) == (verdict, version)
+
+
+def test_all_that_came_in_a_pause_of_this_computer_is_read_before_the_verdict() -> None:
+    check = version_check(planned(), UpgradeOptions())
+    application = Application(check)
+    for _ in range(2):
+        application.next_question()
+        application.answer(VERSION, NEW_VERSION)
+    application.now += 1.0
+    application.answer(VERSION, NEW_VERSION)
+    application.answer(VERSION, version("W2"))
+    assert application.next_question() is None
+    assert check.result.verdict is Verdict.TWO_DEVICES
 
 
 def test_a_bootloader_that_announces_itself_beside_the_new_application_is_a_second_device() -> None:
