@@ -106,9 +106,9 @@ class Announcing:
         return self.first_at + self.timings.announcing_on_s + 2 * self.timings.burst_s
 
     def goes_on(self, now: float) -> bool:
-        """Return True if they have gone on beyond a burst, and the silence since is no longer than
-        a pause between them.
+        """Return True if they have gone on beyond a burst, also without their longest pause, in
+        which the device may have hung or restarted, and the silence since is no longer than that.
         """
-        silence_s = now - self.last_at
-        has_ended = silence_s > self._longest_pause_s + self.timings.burst_s
-        return not has_ended and self.lasted_s >= self.timings.announcing_on_s
+        pause_s, silence_s = self._longest_pause_s, now - self.last_at
+        has_ended = silence_s > pause_s + self.timings.burst_s
+        return not has_ended and self.lasted_s - pause_s >= self.timings.announcing_on_s

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 import random
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from itertools import count
 from math import inf
@@ -25,6 +25,7 @@ from flasher.simulate.independent import (
     FEEDBACK,
     NAK,
     REPORT,
+    REQUEST,
     UPDATE,
     IndependentDevice,
     frames_of,
@@ -41,6 +42,10 @@ _ROUNDING_S: Final = 1e-9
 _UPDATE: Final = UPDATE.to_bytes(2, "big")
 _HEADER, _GENERAL_FEEDBACK = b"\x55\xaa", FEEDBACK.to_bytes(2, "big")
 _BOOT_VERSION: Final = BOOT_VERSION.to_bytes(2, "big")
+_REQUEST: Final = REQUEST.to_bytes(2, "big")
+_ANSWERS: Final = (ACK.to_bytes(2, "big"), NAK.to_bytes(2, "big"))
+_SHOWN: Final = 3
+"""Answers too many that a bad line does not make of one device (docs/explanation/safety.md)."""
 _NUMBERED_ANSWERS: Final = {"ack": ACK, "nak": NAK}
 
 
@@ -179,6 +184,7 @@ class Unit:
         """Run on without a fault; a power supply that is off stays off."""
         self._end_hang(now)
         self._answers.clear()
+        self._late.clear()
         self.fail_flash(0)
 
     def fail_flash(self, count: int) -> None:
@@ -328,10 +334,13 @@ class PlanBus(SimulatedBus):
         """Link of the tool that runs now."""
         self.is_garbled = False
         """The host's adapter has another bit rate: it receives error frames only."""
-        self.heard: set[Any] = set()
-        """Units and engines that began a message alone that reached the tool; the player empties
-        it. General feedback does not count: an application sends it to all that is not for it.
+        self._alone: Counter[Any] = Counter()
+        """How often each unit or engine began a message alone that reached the tool. General
+        feedback does not count: an application sends it to all that is not for it. Nor does a
+        request for the transfer: one device may repeat it (R16).
         """
+        self.has_ended = False
+        """End of transfer was sent; set by the player."""
         self.burst_ends_at = inf
         """Time up to which boot versions do not count either; set by the player. One device may
         continue its burst after the update command, or begin it anew.
@@ -373,12 +382,24 @@ class PlanBus(SimulatedBus):
     def _hear(self, sender: Any, data: bytes, now: float) -> None:
         """Note a unit that sends what another one would not."""
         word = data[4:6]
-        if data[:2] != _HEADER or word == _GENERAL_FEEDBACK:
+        if data[:2] != _HEADER or word in (_GENERAL_FEEDBACK, _REQUEST):
             return
         if word == _BOOT_VERSION and self.awaits_burst:
             self.awaits_burst, self.burst_ends_at = False, now + DEFAULT_TIMINGS.burst_s
-        if word != _BOOT_VERSION or now > self.burst_ends_at:
-            self.heard.add(sender.engine)
+        if word == _BOOT_VERSION and now <= self.burst_ends_at:
+            return
+        is_answer = word in _ANSWERS and not self.has_ended
+        self._alone[sender.engine] += 1 if is_answer else _SHOWN
+
+    @property
+    def heard(self) -> frozenset[Any]:
+        """Units and engines that a bad line of one device cannot have made."""
+        return frozenset(each for each, times in self._alone.items() if times >= _SHOWN)
+
+    def forget_heard(self) -> None:
+        """Begin with another transfer."""
+        self._alone.clear()
+        self.has_ended = False
 
     def _carry(self, frame: Frame, senders: Sequence[Any], now: float) -> None:
         if not frame.is_error:

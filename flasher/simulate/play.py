@@ -296,10 +296,10 @@ class Player:
                 self._phase = what
                 if what == "update":
                     self._at_update = self._present
-                    self.bus.heard.clear()
+                    self.bus.forget_heard()
                     self.bus.burst_ends_at, self.bus.awaits_burst = inf, False
                 elif what == "end" and not self._facts.rules.ends:
-                    self.bus.awaits_burst = True
+                    self.bus.awaits_burst = self.bus.has_ended = True
                 elif what == "packet":
                     ends_at = now + DEFAULT_TIMINGS.leftover_boot_version_s
                     self.bus.burst_ends_at = min(self.bus.burst_ends_at, ends_at)
@@ -463,7 +463,7 @@ class Player:
         ended_at = self.clock.now()
         took_s = ended_at - began_at
         interrupted_s = ended_at - (self._interrupted_at or ended_at)
-        heard = frozenset(self.bus.heard)
+        heard = self.bus.heard
         at_end = [self._content(unit) for unit in self.units]
         self._end_faults()
         self._wait(self.clock.now() + SETTLE_S)

@@ -376,6 +376,7 @@ _BURST_S = 4 * 0.05
         (0.3, 0.2, 1, Verdict.NO_ANSWER),
         (0.3, 0.2, 2, Verdict.NO_ANSWER),
         (0.3, 0.9, 2, Verdict.NO_ANSWER),
+        (0.3, 4.5, 2, Verdict.NO_ANSWER),
         (4.7, 0.2, 1, Verdict.NO_ANSWER),
     ],
 )
@@ -392,7 +393,7 @@ def test_a_bootloader_that_announces_itself_beyond_a_burst_runs_no_application(
     while application.next_question() is not None:
         pass
     assert check.result.verdict is verdict
-    assert application.now < 50.0 + 10.2
+    assert application.now < 50.0 + 12.0
 
 
 def test_an_application_that_starts_after_the_bootloader_announced_itself_late_is_right() -> None:

@@ -89,6 +89,14 @@ def test_frames_that_a_killed_process_left_in_its_adapter_are_those_of_a_host() 
         job packets=8 gap=0.024 ; mock reset_in_transfer=restarts after_complete=restarts
         @end+0.147118 stall seconds=6.62761 ; @packet2 power seconds=0.070656
         """,
+        # A bootloader that starts its application hangs in its announcement.
+        "job ; mock after_complete=restarts ; @end+0.113727 hang seconds=4.939419",
+        # An answer that is late by more than the rest of the run would disturb the next one.
+        """
+        job packets=45 timeout=3.8 ; independent application=none store=0.031856
+        @packet29 answer becomes=twice shift=-1 late=7.409289 count=2
+        @update hang seconds=1.047747
+        """,
         # An update command with gaps takes longer than the device listens.
         """
         job packets=10 gap=0.056 ; adapter echoes=true delay=0.000477 jitter=0.005232 seed=60055551
