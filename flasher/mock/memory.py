@@ -67,10 +67,13 @@ class FlashMemory:
     def read(self, address: int, size_bytes: int) -> bytes:
         """Read bytes. Raises FlashRangeError."""
         offset = self._offset(address, size_bytes)
-        first = offset - offset % self.page_size_bytes
+        place = offset % self.page_size_bytes
+        first = offset - place
+        if place + size_bytes <= self.page_size_bytes:  # as a rule
+            return bytes(self._pages.get(first, self._erased_page)[place : place + size_bytes])
         pages = range(first, offset + size_bytes, self.page_size_bytes)
         found = b"".join(self._pages.get(page, self._erased_page) for page in pages)
-        return found[offset - first :][:size_bytes]
+        return found[place:][:size_bytes]
 
     def erase_page(self, address: int) -> None:
         """Erase the page that begins at `address`.

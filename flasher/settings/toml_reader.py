@@ -31,6 +31,7 @@ CONFIG: Final = ConfigDict(
     strict=True,  # no conversion between numbers and texts
     allow_inf_nan=False,
     use_attribute_docstrings=True,
+    defer_build=True,
 )
 FAULTS_SHOWN: Final = 8
 _UNKNOWN: Final = frozenset({"extra_forbidden", "unexpected_keyword_argument"})

@@ -199,16 +199,14 @@ class JournalStore(DualBankStore):
 
     def _entries(self) -> list[tuple[int, tuple[int, int, int, bytes]]]:
         """Address and contents of every place for an entry."""
-        found = []
-        for page in range(
-            self._journal, self._journal + self.pages * self._page_bytes, self._page_bytes
-        ):
-            for at in range(
-                page, page + self._page_bytes - self._entry_bytes + 1, self._entry_bytes
-            ):
-                size_bytes, crc, number, magic = _RECORD.unpack(self.flash.read(at, _RECORD.size))
-                found.append((at, (size_bytes, crc, number, magic)))
-        return found
+        start, page_bytes, entry_bytes = self._journal, self._page_bytes, self._entry_bytes
+        pages = range(start, start + self.pages * page_bytes, page_bytes)
+        return [
+            (page + place, _RECORD.unpack_from(content, place))
+            for page in pages
+            for content in (self.flash.read(page, page_bytes),)
+            for place in range(0, page_bytes - entry_bytes + 1, entry_bytes)
+        ]
 
     def erasing_bank(self, bank: int, size_bytes: int) -> list[Operation]:
         return super().erasing_bank(bank, size_bytes)[1:]  # no record is in the bank
