@@ -10,6 +10,7 @@ import os
 import time
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import pairwise
@@ -170,13 +171,15 @@ class Ledger:
         """Finished batches that are not written."""
         self._lock = FileLock(f"{path}.lock", timeout=0)
         try:
-            self._file = path.open("ab")
+            self._file = path.open("a+b")  # only to write, it would wait for the reader of a pipe
         except OSError as error:
             raise self._not_written(error) from error
         try:
             self._lock.acquire()
-        except Timeout as error:
+        except OSError as error:
             self._file.close()
+            if not isinstance(error, Timeout):
+                raise self._not_written(error) from error
             raise UsageError(
                 f"The ledger {printable(str(path))} is in use.",
                 cause="another flasher writes it",
@@ -253,7 +256,8 @@ class Ledger:
 
     def close(self) -> None:
         """Release the file. What was added since the last `write` is lost."""
-        self._file.close()
+        with suppress(OSError):  # it writes again what did not fit on the disk
+            self._file.close()
         self._lock.release()
 
     def __enter__(self) -> Self:

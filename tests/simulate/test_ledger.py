@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterable
 from itertools import islice
 from pathlib import Path
@@ -198,6 +199,36 @@ def test_files_that_are_no_ledger_are_refused(tmp_path: Path) -> None:
         merge([tmp_path / "missing.jsonl"])
     with pytest.raises(UsageError, match="contain no result"):
         merge([written(tmp_path / "empty.jsonl", [])])
+
+
+def test_a_full_disk_is_an_error_and_what_was_written_before_counts(tmp_path: Path) -> None:
+    resource = pytest.importorskip("resource")
+    path = written(tmp_path / "ledger.jsonl", everything()[:3])
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 20, before[1]))
+    try:
+        with pytest.raises(UsageError, match="cannot be written: File too large"):
+            written(path, everything()[3:6])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    merged = merge([path])
+    assert merged.result.runs == sum(map(run_quickly, everything()[:3]), no_result()).runs
+    assert "line 2: the last line was written in part" in merged.notices[0]
+    with Ledger(path, 0, RUNS) as again:
+        assert len([*again.left(everything())]) == len(everything()) - 3
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no named pipes")
+def test_a_pipe_is_no_ledger_and_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(UsageError, match="cannot be written"):
+        Ledger(tmp_path / "pipe", 0, RUNS)
+
+
+def test_a_lock_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "ledger.jsonl.lock").mkdir()
+    with pytest.raises(UsageError, match="cannot be written"):
+        Ledger(tmp_path / "ledger.jsonl", 0, RUNS)
 
 
 def test_shares_cover_each_batch_once() -> None:
