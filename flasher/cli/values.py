@@ -26,6 +26,7 @@ _NUMBER: Final = re.compile(r"(0[xX][0-9a-fA-F_]+|[0-9][0-9_]*)([kKmM]?)")
 _ADDRESS: Final = re.compile(r"0|0[xX][0-9A-Fa-f_]+")
 _SUFFIXES: Final = {"": 1, "k": 1024, "m": 1024 * 1024}
 _KEY_VALUE: Final = re.compile(r"([A-Za-z_]\w*)=(.*)")
+_PROCESSES_MAX: Final = 1024
 _PORT_MAX: Final = 65_535
 _CHANNEL: Final = re.compile(r"v?can\d+")
 _NETWORK: Final = Path("/sys/class/net")
@@ -93,6 +94,14 @@ def count(text: str) -> int:
     value = number(text)
     if value < 1:
         raise click.BadParameter("must be 1 or more")
+    return value
+
+
+def processes(text: str) -> int:
+    """Parse a number of processes."""
+    value = count(text)
+    if value > _PROCESSES_MAX:
+        raise click.BadParameter(f"must be 1 to {_PROCESSES_MAX}")
     return value
 
 

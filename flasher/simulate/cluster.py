@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from typing import Final
 
 from distributed import Client, Future, KilledWorker, Scheduler, Worker, WorkerPlugin, as_completed
+from distributed.comm.addressing import resolve_address
 from distributed.core import Status
 
 from flasher.errors import UsageError
@@ -97,6 +98,7 @@ def run_on_cluster(
 def _connected(address: str) -> Iterator[Client]:
     shown = printable(address)
     try:
+        resolve_address(address)  # a client that fails by its address ends 20 s later
         client = Client(address, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise UsageError(

@@ -22,13 +22,23 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
-from functools import cache
-from typing import Any, ClassVar, Final, Literal, get_args, get_origin, get_type_hints
+from functools import cache, partial
+from typing import Annotated, Any, ClassVar, Final, Literal, get_args, get_origin, get_type_hints
 
 from flasher.bus.simulated import DEFAULT_QUEUE_FRAMES
 from flasher.mock.profile import DeviceProfile
+from flasher.protocol.spec import PACKET_COUNT_MAX, PACKET_DATA_SIZE
 from flasher.simulate.independent import Choices
 
+TEXT_MAX_SIZE: Final = 1_000_000
+_LIMITS: Final[dict[object, tuple[float, float]]] = {
+    int: (0, 0xFFFF),
+    float: (0, 3600),
+}
+"""Of numbers without another annotation; most floats are seconds."""
+Count = Annotated[int, (1, 1000)]
+Interval = Annotated[float, (0.0001, 3600)]
+Share = Annotated[float, (0, 1)]
 Sender = Literal["any", "host", "device"]
 _NUMBERED: Final = ("packet", "frame", "flash")
 _SECONDS: Final = r"\d+(?:\.\d+)?(?:e[+-]?\d+)?"
@@ -58,7 +68,7 @@ class When:
         found = _WHEN.fullmatch(text)
         seconds = float((found and (found["at"] or found["plus"])) or 0)
         if found is None or not math.isfinite(seconds):
-            raise ValueError(f"{text!r} is not a time of a plan")
+            raise ValueError(f"{text[:40]!r} is not a time of a plan")
         what = found["counted"] or found["what"] or ""
         return cls(what, int(found["number"] or 0), seconds)
 
@@ -90,8 +100,8 @@ class Job(Clause):
 
     NAME = "job"
     target: Literal["bms", "wmc", "obc"] = "bms"
-    packets: int = 20
-    short: int = 5
+    packets: Annotated[int, (1, PACKET_COUNT_MAX)] = 20
+    short: Annotated[int, (0, PACKET_DATA_SIZE - 1)] = 5
     """Bytes that the last packet is short of a whole one."""
     image: int = 5
     """Seed of the image's bytes."""
@@ -114,11 +124,11 @@ class Adapter(Clause):
     """Seconds from the end of a frame to its echo."""
     jitter: float = 0.0
     """Up to so much more; later echoes overtake."""
-    lost: float = 0.0
+    lost: Share = 0.0
     """Share of the echoes that never come."""
-    doubled: float = 0.0
+    doubled: Share = 0.0
     """Share that comes twice."""
-    queue: int = DEFAULT_QUEUE_FRAMES
+    queue: Count = DEFAULT_QUEUE_FRAMES
     """Frames that wait to be sent; a full queue takes no more."""
     seed: int = 1
 
@@ -132,7 +142,7 @@ class Device(Clause):
     """Version of the old application."""
     begins: Literal["application", "boot", "off"] = "application"
     """`boot`: it is switched on at the beginning."""
-    drift: float = 0.0
+    drift: Annotated[float, (-0.5, 0.5)] = 0.0
     """Its clock is faster by this share."""
     choices: str = ""
     """What else a kind of device can choose."""
@@ -172,9 +182,9 @@ class Load(Clause):
     """Other traffic, one frame every so many seconds; id 0 wins every arbitration."""
 
     NAME = "load"
-    id: int = 0x712
-    every: float = 0.002
-    seconds: float = 1e9
+    id: Annotated[int, (0, 0x7FF)] = 0x712
+    every: Interval = 0.002
+    seconds: float = 3600.0
 
 
 # -- faults of frames ------------------------------------------------------------------------------
@@ -185,7 +195,7 @@ class OnFrames(Clause):
     """Happens to the next `count` frames of a sender."""
 
     sender: Sender = "any"
-    count: int = 1
+    count: Count = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,7 +234,7 @@ class Flip(OnFrames):
     """One bit is wrong, and the checksum of the CAN frame does not detect it."""
 
     NAME = "flip"
-    bit: int = 0
+    bit: Annotated[int, (0, 63)] = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,7 +242,7 @@ class Truncate(OnFrames):
     """Only its first `to` bytes arrive."""
 
     NAME = "truncate"
-    to: int = 3
+    to: Annotated[int, (0, 8)] = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,10 +252,10 @@ class Noise(Clause):
     NAME = "noise"
     seconds: float = 0.5
     sender: Sender = "any"
-    lost: float = 0.0
-    wrong: float = 0.0
-    doubled: float = 0.0
-    errors: float = 0.0
+    lost: Share = 0.0
+    wrong: Share = 0.0
+    doubled: Share = 0.0
+    errors: Share = 0.0
     seed: int = 1
 
 
@@ -260,7 +270,7 @@ class Unsolicited(Clause):
     what: Literal["ack", "nak", "boot", "request", "complete", "feedback", "unknown"] = "nak"
     """`unknown` is a message of no document."""
     number: int = 1
-    count: int = 1
+    count: Count = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,11 +288,11 @@ class Answer(OnDevice):
     becomes: Literal["same", "ack", "nak", "silence", "twice"] = "same"
     """An ACK becomes a NAK of the same number, and the reverse; `twice`: it is sent twice, unless
     it is general feedback."""
-    shift: int = 0
+    shift: Annotated[int, (-0xFFFF, 0xFFFF)] = 0
     """Added to the number of an ACK or NAK."""
     late: float = 0.0
     """Seconds."""
-    count: int = 1
+    count: Count = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -313,7 +323,7 @@ class FlashFails(OnDevice):
     """Its next `count` flash operations change nothing, and it can detect that; not `mock`."""
 
     NAME = "flash-fails"
-    count: int = 1
+    count: Count = 1
 
 
 # -- faults of the host's side ---------------------------------------------------------------------
@@ -358,8 +368,8 @@ class Tool(Clause):
     packet with a wrong checksum, `shortens` an update command for an image that is one byte
     shorter, `answers` an ACK, which only a device sends.
     """
-    count: int = 1
-    every: float = 0.2
+    count: Count = 1
+    every: Interval = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -430,11 +440,21 @@ class Plan:
 
     @classmethod
     def parse(cls, text: str) -> Plan:
-        return cls(tuple(parse_clauses(text, CLAUSES)))
+        """Raises ValueError for a text that is no plan, UsageError for what `mock` refuses."""
+        if len(text) > TEXT_MAX_SIZE:
+            raise ValueError(f"it has more than {TEXT_MAX_SIZE:,} characters")
+        plan = cls(tuple(parse_clauses(text, CLAUSES)))
+        if not plan.clauses:
+            raise ValueError("it is empty")
+        for kind in (Job, Adapter):
+            own = [each for each in plan.clauses if isinstance(each, kind)]
+            if len(own) > 1 or any(each.when for each in own):
+                raise ValueError(f"{kind.NAME!r} holds for all of a plan: name it once, no time")
+        return plan
 
 
 def parse_clauses(text: str, kinds: Mapping[str, type[Clause]]) -> Iterator[Clause]:
-    """The clauses of a text. Raises ValueError for one that is none of `kinds`."""
+    """Yield the clauses of a text. Raises ValueError for one that is none of `kinds`."""
     lines = (part.strip() for line in text.splitlines() for part in line.split(";"))
     for line in lines:
         if line:
@@ -445,8 +465,13 @@ def _clause(line: str, kinds: Mapping[str, type[Clause]]) -> Clause:
     words = line.split()
     when = When.parse(words.pop(0)) if words and words[0].startswith("@") else None
     if not words or words[0] not in kinds:
-        raise ValueError(f"{line!r} does not begin with the name of a clause: {', '.join(kinds)}")
+        raise ValueError(
+            f"{line[:40]!r} does not begin with the name of a clause: {', '.join(kinds)}"
+        )
     kind = kinds[words[0]]
+    names = [word.partition("=")[0] for word in words[1:]]
+    if len({*names}) < len(names):
+        raise ValueError(f"{line[:40]!r} has a value twice")
     own = {known.name for known in fields(kind)} - {"choices", "when"}
     given = [word for word in words[1:] if word.partition("=")[0] in own]
     others = [word for word in words[1:] if word not in given]
@@ -456,7 +481,7 @@ def _clause(line: str, kinds: Mapping[str, type[Clause]]) -> Clause:
         clause.chosen()  # type: ignore[attr-defined]  # raises for an unknown choice
         return clause
     if others:
-        raise ValueError(f"{line!r}: {kind.NAME} has no {' '.join(others)}")
+        raise ValueError(f"{kind.NAME} has no {others[0][:40]!r}")
     return kind(when=when, **values)
 
 
@@ -464,7 +489,7 @@ def _text(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-_type_hints = cache(get_type_hints)
+_type_hints = cache(partial(get_type_hints, include_extras=True))
 
 
 def _values(kind: type, words: Sequence[str]) -> dict[str, Any]:
@@ -475,21 +500,32 @@ def _values(kind: type, words: Sequence[str]) -> dict[str, Any]:
         name, _, text = word.partition("=")
         hint = hints.get(name)
         if hint is None:
-            raise ValueError(f"{kind.__name__} has no {name!r}")
+            raise ValueError(f"{kind.__name__} has no {name[:40]!r}")
+        limits = _LIMITS.get(hint)
+        if get_origin(hint) is Annotated:
+            hint, limits = get_args(hint)[:2]
         if get_origin(hint) is Literal:
             if text not in get_args(hint):
-                raise ValueError(f"{word!r}: it is one of {', '.join(get_args(hint))}")
+                raise ValueError(f"{word[:40]!r}: it is one of {', '.join(get_args(hint))}")
             values[name] = text
         elif hint is bool:
             if text not in ("true", "false"):
-                raise ValueError(f"{word!r}: it is true or false")
+                raise ValueError(f"{word[:40]!r}: it is true or false")
             values[name] = text == "true"
-        elif hint is int:
-            values[name] = int(text, 0)
-        elif hint is float:
-            values[name] = float(text)
-            if not math.isfinite(values[name]):
-                raise ValueError(f"{word!r}: it is not finite")
+        elif hint in (int, float):
+            values[name] = _number(word, text, hint, limits)
         else:
             values[name] = text
     return values
+
+
+def _number(word: str, text: str, kind: type, limits: object) -> float:
+    try:
+        value: float = int(text, 0) if kind is int else float(text)
+    except ValueError as error:
+        raise ValueError(f"{word[:40]!r}: it is not a number") from error
+    if kind is float and not math.isfinite(value):
+        raise ValueError(f"{word[:40]!r}: it is not finite")
+    if isinstance(limits, tuple) and not limits[0] <= value <= limits[1]:
+        raise ValueError(f"{word[:40]!r}: it is from {limits[0]:g} to {limits[1]:g}")
+    return value

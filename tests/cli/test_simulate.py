@@ -6,6 +6,7 @@ import html
 import json
 import re
 from contextlib import nullcontext
+from io import StringIO
 from pathlib import Path
 
 import pytest
@@ -109,9 +110,22 @@ def test_a_replay_is_the_same_each_time_and_leaves_a_trace(
     assert "verdict: completed" in capsys.readouterr().out
 
 
-def test_what_is_no_plan_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_no_plan_is_refused(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert main(["simulate", "replay", "job packets=many"]) == ExitCode.USAGE
     assert "The plan cannot be read: " in capsys.readouterr().err
+    monkeypatch.setattr("sys.stdin", StringIO(""))
+    assert main(["simulate", "replay", "-"]) == ExitCode.USAGE
+    assert "The plan cannot be read: it is empty." in capsys.readouterr().err
+    monkeypatch.setattr("sys.stdin", StringIO("job;" * 300_000))
+    assert main(["simulate", "replay", "-"]) == ExitCode.USAGE
+    assert "more than 1,000,000 characters" in capsys.readouterr().err
+
+
+@each("count", ["0", "1025", "100000000"])
+def test_a_number_of_processes_that_no_computer_has_is_refused(count: str) -> None:
+    assert main(["simulate", "--jobs", count]) == ExitCode.USAGE
 
 
 @each("text", ["0/3", "4/3", "3", "a/b"])

@@ -175,6 +175,15 @@ def test_an_address_without_a_scheduler_is_refused(monkeypatch: pytest.MonkeyPat
             )
 
 
+def test_no_client_begins_with_what_is_no_address(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that fails in its constructor is left half open."""
+    monkeypatch.setattr(clusters, "Client", lambda *_, **__: pytest.fail("it has begun"))
+    with pytest.raises(UsageError, match="No scheduler"):
+        run_on_cluster(
+            "nonsense", [], on_result=lambda *_: None, is_stopped=never, run_one=run_quickly
+        )
+
+
 def test_a_cluster_without_workers_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clusters, "_WORKER_S", 0.2)
     with (

@@ -72,11 +72,41 @@ def test_long_and_short_times_are_read_as_they_are_printed(line: str) -> None:
         "@reset5 drop",
         "@1.5+3 drop",
         "@1e400 drop",
+        "",
+        " ; ;",
+        "job packets=0",
+        "job packets=65536",
+        "job packets=3 packets=4",
+        "job ; job",
+        "@1 adapter",
+        "job short=128",
+        "load every=0",
+        "@1 drop count=1001",
+        "@1 unsolicited number=65536",
+        "@1 power device=-1",
+        "@1 stall seconds=3600.1",
+        "mock drift=-1",
+        "independent erase=-0.1",
+        "adapter queue=0",
     ],
 )
 def test_what_is_no_plan_is_refused(line: str) -> None:
     with pytest.raises(ValueError, match=r"\w"):
         Plan.parse(line)
+
+
+@each(
+    "line", ["x" * 10_000, f"job packets={'9' * 4_000}", f"job {'x' * 9_000}", f"@{'1' * 9_000}s"]
+)
+def test_the_reason_quotes_only_the_beginning_of_a_long_text(line: str) -> None:
+    with pytest.raises(ValueError, match=r"\w") as refused:
+        Plan.parse(line)
+    assert len(str(refused.value)) < 400
+
+
+@each("line", ["job packets=1 short=127", "job packets=3 ; @1 stall seconds=3600", "load id=0x7FF"])
+def test_a_plan_at_its_limits_is_played(line: str) -> None:
+    play(Plan.parse(line))
 
 
 @pytest.mark.slow

@@ -226,7 +226,7 @@ class Choices:
         "--repeat", type=values.count, default="1", metavar="N", help="run every case N times",
     )]  # fmt: skip
     jobs: Annotated[int, _what(
-        "--jobs", type=values.count, default="1", metavar="N",
+        "--jobs", type=values.processes, default="1", metavar="N",
         help="run cases on N processes side by side, with --mock or --subject",
     )]  # fmt: skip
     timeout: Annotated[float | None, _what(

@@ -45,7 +45,7 @@ from flasher.simulate.campaign import (
 from flasher.simulate.ledger import Ledger, Merged
 from flasher.simulate.ledger import merge as merge_ledgers
 from flasher.simulate.oracle import Violation
-from flasher.simulate.plan import Plan, Subject
+from flasher.simulate.plan import TEXT_MAX_SIZE, Plan, Subject
 from flasher.simulate.play import Player, Verdict
 from flasher.simulate.shrink import shows, shrink
 from flasher.simulate.sweep import PartResult, parts
@@ -134,7 +134,7 @@ class Campaign:
         help="seed of the first run; the next run has the next one",
     )]  # fmt: skip
     jobs: Annotated[int, _what(
-        "--jobs", type=values.count, default="1", metavar="N", brief=True,
+        "--jobs", type=values.processes, default="1", metavar="N", brief=True,
         help="run on N processes side by side",
     )]  # fmt: skip
     shard: Annotated[tuple[int, int] | None, _what(
@@ -403,13 +403,14 @@ def replay(output: Output, *, text: str, subject: str | None, trace_file: Path |
     """Play a plan, as printed with a violation, exactly as it was: - reads it from standard input.
     With -v, every frame, fault and event is printed.
     """
-    line = sys.stdin.read() if text == "-" else text
+    line = sys.stdin.read(TEXT_MAX_SIZE + 1) if text == "-" else text
     try:
         plan = Plan.parse(line)
     except ValueError as error:
         raise UsageError(
             f"The plan cannot be read: {printable(str(error))}.",
-            remedy="Give the plan as one argument, in quotes, as it was printed.",
+            remedy="Give the plan as it was printed: in quotes as one argument, or without quotes"
+            " on standard input.",
         ) from error
     _check_device(plan, subject)
     check_writable(trace_file, TRACE_FILE, typed_values(but="trace_file"))
