@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import gc
+import importlib
 import os
 import sys
 from collections.abc import Generator, Iterator
+from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 # Before all others are imported: what they make stays (`pytest_collection_finish`).
 gc.disable()
+# Without a cache each process of the tests would compile all modules again, for 10 s.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import hypothesis  # noqa: E402
 import pytest  # noqa: E402
@@ -42,6 +48,20 @@ def pytest_configure(config: pytest.Config) -> None:
     # How long an example may take depends on the computer, and on what else it does.
     hypothesis.settings.register_profile("any computer", deadline=None)
     hypothesis.settings.load_profile("any computer")
+
+
+def pytest_collection(session: pytest.Session) -> None:
+    """On a fresh computer the workers share the work to compile: the second one begins with the
+    last module, and each finds what the other has compiled by then.
+    """
+    config = session.config
+    if config.args_source is pytest.Config.ArgsSource.ARGS:
+        return
+    if os.environ.get("PYTEST_XDIST_WORKER") == "gw1":
+        for path in sorted(Path(__file__).parent.rglob("test_*.py"), reverse=True):
+            name = ".".join(path.relative_to(config.rootpath).with_suffix("").parts)
+            with suppress(Exception, pytest.skip.Exception):  # pytest will report it
+                importlib.import_module(name)
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -109,7 +129,9 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     """For `-n auto`: a worker for each core, and one more for the second lane, whose tests wait for
     other processes and for buses at real pace a third of their time.
     """
-    return (os.cpu_count() or 1) + int(config.option.markexpr == "slow")
+    # Of a computer with many cores a container may have two.
+    affinity = getattr(os, "sched_getaffinity", lambda _process: range(os.cpu_count() or 1))
+    return len(affinity(0)) + int(config.option.markexpr == "slow")
 
 
 @pytest.fixture(scope="session")
