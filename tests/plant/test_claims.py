@@ -47,6 +47,7 @@ from tests.station.postgres import OWNER
 SEEDS = 1500
 
 
+@pytest.mark.slow
 def test_no_order_of_events_passes_a_unit_twice_without_a_mark() -> None:
     met: Counter[str] = Counter()
     for seed in range(SEEDS):
@@ -60,6 +61,7 @@ def test_no_order_of_events_passes_a_unit_twice_without_a_mark() -> None:
     assert min(met["marked"], met["checked"], met["interrupted"]) > SEEDS // 20, met
 
 
+@pytest.mark.slow
 def test_nothing_stays_claimed_after_all_runs_were_sent() -> None:
     for seed in range(200):
         world = World(seed)
@@ -139,6 +141,7 @@ class _CountsBranches(Station):
             return replace(own, known=frozenset({c.takeover for c in centre.claims.values()}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("centre", "station"),
     [

@@ -68,6 +68,7 @@ def test_every_edit_of_a_mistake_changes_a_function(bug: Bug) -> None:
         assert replace(bug, edits=[edit]).codes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bug", BUGS, ids=lambda bug: bug.name)
 def test_a_mistake_spoils_its_plan(bug: UpgradeBug) -> None:
     plan = Plan.parse(bug.plan)

@@ -23,6 +23,7 @@ from flasher.simulate.reached import UNREACHABLE, places, reachable, recorded_ce
 from flasher.simulate.workers import Pace, run_alone
 
 
+@pytest.mark.slow
 def test_the_corpus_reaches_each_place_that_a_campaign_can_reach() -> None:
     found = run_batch(corpus_batch())
     assert found.never_reached == []
@@ -31,6 +32,7 @@ def test_the_corpus_reaches_each_place_that_a_campaign_can_reach() -> None:
     assert (found.corpus_runs, found.runs, found.tallies) == (len(corpus()), 0, {})
 
 
+@pytest.mark.slow
 def test_each_plan_of_the_corpus_reaches_its_place() -> None:
     for place, plan in corpus().items():
         with recorded_cells() as cells:
