@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import importlib
 import os
@@ -27,7 +28,7 @@ if ENGINE_COVERAGE in os.environ:  # before flasher is imported
 
     _engine_coverage = EngineCoverage()
 
-import flasher.python_can  # noqa: E402, F401  before a test imports python-can
+from flasher.python_can import can  # noqa: E402  before a test imports python-can
 
 if TYPE_CHECKING:
     from tests.station.postgres import Server
@@ -93,6 +94,15 @@ def no_wait_for_the_disk() -> Iterator[None]:
     """No test of this process pulls the plug, and all share one disk."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda _file: None)
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def plugins_of_python_can_are_found_once() -> Iterator[None]:
+    """It looks for them in all installed packages, for each trace that is opened."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (can.io.logger, can.io.player):
+            patch.setattr(module, "read_entry_points", functools.cache(module.read_entry_points))
         yield
 
 

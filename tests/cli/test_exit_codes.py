@@ -149,7 +149,7 @@ def other_boot_name(scene: Scene) -> Words:
 
 
 def other_target(_scene: Scene) -> Words:
-    return ("flash", str(SAMPLES / "bms.hex"), "-t", "wmc", *ON_THE_BUS)
+    return ("flash", str(SAMPLES / "bms.bin"), "-t", "wmc", *ON_THE_BUS)
 
 
 def loses_power(scene: Scene) -> Words:
@@ -340,7 +340,7 @@ def test_a_failure_in_the_transfer_says_what_the_device_is_left_with_and_leaves_
 def test_a_missing_file_and_a_directory_are_the_same_kind_of_mistake(
     flasher: Flasher, tmp_path: Path, name: str
 ) -> None:
-    wrong, image = tmp_path / name, SAMPLES / "bms.hex"
+    wrong, image = tmp_path / name, SAMPLES / "bms.bin"
     mock = ("--mock", "--mock-speed", "0")
     for words in (
         ("flash", wrong, "-t", "bms", *mock),

@@ -90,9 +90,9 @@ def test_more_bytes_on_standard_input_than_any_file_has_are_refused(
 
 
 def test_the_manifest_of_standard_input_needs_a_name(
-    flasher: Flasher, pipe: Callable[[bytes], None], tmp_path: Path
+    flasher: Flasher, pipe: Callable[[bytes], None], tmp_path: Path, short_bms: Path
 ) -> None:
-    data = (SAMPLES / "bms.hex").read_bytes()
+    data = short_bms.read_bytes()
     pipe(data)
     run = flasher("manifest", "create", "-", "-t", "bms")
     assert run.code == ExitCode.USAGE

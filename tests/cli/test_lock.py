@@ -11,7 +11,7 @@ from flasher.errors import ExitCode
 from tests.cli.conftest import SAMPLES, Flasher
 
 BUS = ("-i", "socketcan", "-c", "nocan7")
-IMAGE = str(SAMPLES / "bms.hex")
+IMAGE = str(SAMPLES / "bms.bin")
 
 
 @pytest.fixture(autouse=True)

@@ -131,7 +131,7 @@ def test_what_fails_before_a_frame_was_sent_or_heard_leaves_nothing(
     flasher: Flasher, bundle_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    image = str(SAMPLES / "bms.hex")
+    image = str(SAMPLES / "bms.bin")
     for words in (("flash", image, "-t", "bms"), ("info", "-t", "bms"), ("scan",)):
         run = flasher(*words)
         assert run.code == ExitCode.BUS

@@ -285,7 +285,7 @@ def test_cases_that_failed_are_selected_by_the_report_alone(
         (("-t", "bms", "--mock", "--repeat", "0"), 2, "must be 1 or more"),
         (("-t", "bms", "--mock", "--good-image", "no-such.hex"), 2, "no-such.hex"),
         (
-            ("-t", "bms", "-i", "no-such-backend", "--good-image", str(SAMPLES / "bms.hex")),
+            ("-t", "bms", "-i", "no-such-backend", "--good-image", str(SAMPLES / "bms.bin")),
             2,
             "no-such-backend",
         ),
@@ -302,7 +302,7 @@ def test_wrong_usage_is_told_before_anything_is_done(
 
 
 def test_a_second_image_that_is_not_smaller_is_refused(flasher: Flasher) -> None:
-    image = str(SAMPLES / "bms.hex")
+    image = str(SAMPLES / "bms.bin")
     run = flasher(*MOCK, "--good-image", image, "--second-image", image)
     assert run.code == 2
     assert "second image has to be smaller" in run.err
@@ -339,7 +339,7 @@ def test_the_echo_of_own_frames_is_asked_for_where_there_is_one(
         raise BusError("not today")
 
     monkeypatch.setattr("flasher.api.connect", connect)
-    run = flasher("conformance", "-t", "bms", "--good-image", SAMPLES / "bms.hex", *words)
+    run = flasher("conformance", "-t", "bms", "--good-image", SAMPLES / "bms.bin", *words)
     assert run.code == ExitCode.BUS
     assert given.get("receive_own_messages") is asked
 

@@ -28,7 +28,7 @@ from flasher.release.trust import Chain, Role, Trust, TrustedKey, new_chain  # n
 from flasher.settings.manifest import release_of  # noqa: E402
 
 SAMPLES = Path(__file__).parent.parent.parent / "firmware_samples"
-IMAGE = SAMPLES / "bms.bin"
+IMAGE = SAMPLES / "station" / "bms.bin"  # the smaller one
 PRODUCT = "48V"
 FIRST_DAY = "2026-01-10"
 
