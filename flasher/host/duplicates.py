@@ -475,7 +475,7 @@ class DuplicateDetector:
         ):
             return False
         gaps = [later - earlier for earlier, later in pairwise(times)]
-        if not any(is_early for _, is_early in [*rhythm][1:]):
+        if sum(is_early for _, is_early in [*rhythm][1:]) < 2:  # one may be doubled by the line
             return False
         is_uneven = max(gaps) - min(gaps) > _TOLERANCE * self._timings.boot_version_spacing_s
         return is_documented or is_uneven

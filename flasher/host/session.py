@@ -130,6 +130,8 @@ class UpgradeSession(Runner[Result]):
         self._foreign_queries: set[int] = set()
         """Commands of another tool's queries that were reported."""
         self._losses = 0
+        self._unobserved_s = 0.0
+        """Time since `complete` in which the adapter was away."""
         self._began_at = 0.0
         # At power-up no application runs, and nothing is sent before the device announces itself. A
         # device that may be in an open session is asked first: a running application would answer.
@@ -185,6 +187,8 @@ class UpgradeSession(Runner[Result]):
         self._losses += 1
         if self._checking is None:
             self.interrupt(LinkRestored(away_s))
+        else:
+            self._unobserved_s += away_s
 
     # -- from stage to stage ---------------------------------------------------------------------
 
@@ -217,7 +221,11 @@ class UpgradeSession(Runner[Result]):
         if outcome.ok:
             self.limit_at = self.deadline_at
             verification = yield from self._verified()
-            outcome = replace(outcome, device_left=verification.device_left)
+            outcome = replace(
+                outcome,
+                device_left=verification.device_left,
+                unobserved_s=outcome.unobserved_s + self._unobserved_s,
+            )
         return Result(outcome, verification, self._guard.shutdown_heard, previous)
 
     def _new_identify(self) -> IdentifyStage:

@@ -465,6 +465,11 @@ def test_bootloaders_that_alternate_are_two_also_where_neither_hears_an_update_c
     assert watch.evidence == ALTERNATELY
 
 
+def test_one_boot_version_that_the_line_doubles_is_no_second_bootloader() -> None:
+    assert Watch().announces(0, 64, 1, 63, 64).evidence == ""
+    assert Watch().announces(0, 64, 1, 63, 1).evidence == ALTERNATELY
+
+
 @each("early", [2, 20, 47])
 def test_one_that_begins_its_burst_anew_at_each_update_command_is_one(early: int) -> None:
     watch = Watch().announces(0, 64)

@@ -462,6 +462,18 @@ def test_other_findings_refuse_a_silent_device_as_ever() -> None:
 # -- after the end --------------------------------------------------------------------------------
 
 
+def test_time_without_the_adapter_after_the_end_is_unobserved() -> None:
+    dialogue = Dialogue()
+    dialogue.to_packet(1)
+    dialogue.say(Ack(1))
+    dialogue.expect(EndOfTransfer)
+    dialogue.say(Complete())
+    dialogue.session.link_back(dialogue.now + 1.4)
+    dialogue.wait(1.6)
+    assert dialogue.result.ok
+    assert dialogue.result.outcome.unobserved_s == pytest.approx(1.4)
+
+
 def test_a_second_device_that_goes_on_after_the_end_is_no_success() -> None:
     dialogue = Dialogue(level=Level.VERSION)
     dialogue.to_packet(1)

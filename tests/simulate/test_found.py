@@ -97,6 +97,8 @@ def test_frames_that_a_killed_process_left_in_its_adapter_are_those_of_a_host() 
         @packet29 answer becomes=twice shift=-1 late=7.409289 count=2
         @update hang seconds=1.047747
         """,
+        # A line doubles a boot version.
+        "job target=obc ; independent begins=boot ; @update answer becomes=twice",
         # An update command with gaps takes longer than the device listens.
         """
         job packets=10 gap=0.056 ; adapter echoes=true delay=0.000477 jitter=0.005232 seed=60055551
