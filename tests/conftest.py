@@ -136,12 +136,12 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """For `-n auto`: a worker for each core, and one more for the second lane, whose tests wait for
-    other processes and for buses at real pace a third of their time.
+    """For `-n auto`: a worker for each core, and two more for the second lane, whose tests wait for
+    other processes and for buses at real pace nearly half of their time.
     """
     # Of a computer with many cores a container may have two.
     affinity = getattr(os, "sched_getaffinity", lambda _process: range(os.cpu_count() or 1))
-    return len(affinity(0)) + int(config.option.markexpr == "slow")
+    return len(affinity(0)) + 2 * int(config.option.markexpr == "slow")
 
 
 @pytest.fixture(scope="session")
