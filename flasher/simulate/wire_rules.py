@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 from flasher.protocol.frame import Frame
-from flasher.protocol.spec import FRAMES_PER_PACKET, OVERHEAD_SIZE, TARGETS
+from flasher.protocol.spec import COMMAND_SIZE, FRAMES_PER_PACKET, OVERHEAD_SIZE, TARGETS
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.simulate import plan as plans
 from flasher.simulate.independent import (
@@ -142,14 +142,16 @@ class WireRules:
         """Check a frame of the host; return the message that begins with it."""
         data = frame.data
         gap_s, self._ended_at = now - self._ended_at, now
-        name = _COMMANDS.get(data[4:6]) if data[:3] == b"\x55\xaa\x16" else None
+        # As a reassembler knows it: an image may contain the first two bytes (2.2.1).
+        is_head = len(data) == 8 and data[:2] == b"\x55\xaa" and data[3] == data[5] + COMMAND_SIZE
+        name = _COMMANDS.get(data[4:6]) if is_head and data[2] == WRITE else None
         # Unlike `_left` also beside a device that restarts: another one may take the command.
-        if name is not None:
+        if is_head:
             self._update_left = data[3] + OVERHEAD_SIZE if name == "update" else 0
         if self._update_left:
             self._update_left = max(0, self._update_left - len(data))
             self.has_update |= not self._update_left
-        if name is None:
+        if not is_head:
             if self._left > 0:
                 limit_s = DEFAULT_TIMINGS.inter_frame_timeout_s + _TOLERANCE_S
                 # One frame may have been on its way to the adapter when the host paused.
@@ -158,22 +160,21 @@ class WireRules:
                 self._had_gap = gap_s > limit_s
                 self._left -= len(data)
                 self._end_message(now)
-            elif data[:2] == b"\x55\xaa" and len(data) == 8:
-                self._left = data[3] + OVERHEAD_SIZE - len(data)
-                self._kind = ""
             return None
         is_short = gap_s < DEFAULT_TIMINGS.inter_frame_timeout_s - _TOLERANCE_S
         # The device dropped a message whose rest came after a gap.
         if self._left > 0 and is_short and self._checks_messages and not self._had_gap:
             self._break("a message begins while the device waits for the rest of another one")
+        number = data[7] if name == "packet" else 0
+        # A pause cut it: what came meanwhile answers it as well.
+        is_begun_again = self._left > 0 and (name, number) == (self._kind, self._number)
+        self._kind, self._number, self._had_gap = name or "", number, False
+        self._left = data[3] + OVERHEAD_SIZE - len(data)
+        if name is None:
+            return None
         if now - self._heads.get(data, float("-inf")) <= _ECHOED_S:
             self._sent_twice.add(data)
         self._heads[data] = now
-        number = data[7] if name == "packet" and len(data) > 7 else 0
-        # A pause cut it: what came meanwhile answers it as well.
-        is_begun_again = self._left > 0 and (name, number) == (self._kind, self._number)
-        self._kind, self._number, self._had_gap = name, number, False
-        self._left = data[3] + OVERHEAD_SIZE - len(data)
         self._check_begin(name, number, now, is_begun_again=is_begun_again)
         self._end_message(now)
         return Begun(name, number)

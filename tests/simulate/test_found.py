@@ -124,6 +124,10 @@ def test_frames_that_a_killed_process_left_in_its_adapter_are_those_of_a_host() 
         # A device that restarts more slowly than the tool waits.
         "job packets=4 ; independent restart=4.999772",
         "job packets=4 ; mock reset_delay_s=5.00062",
+        # The third frame of packet 2 begins as a message does; a stray boot version is no restart.
+        "job packets=10 image=471 ; mock ; @packet2 unsolicited what=boot",
+        # A question in which this computer paused is sent again.
+        "job packets=3 gap=0.052 ; @0.144301 stall seconds=0.076924",
         # Two restarts of a device whose application answers no query: two bursts, then silence.
         """
         job packets=3 image=952 ; independent after_complete=restarts answers=false
