@@ -349,6 +349,8 @@ class PlanBus(SimulatedBus):
         """The next boot version begins a burst that does not count: one device may start its new
         application through the bootloader.
         """
+        self.on_late: Callable[[float], None] = lambda _now: None
+        """Called when a delayed frame of a device arrives."""
         self._watch = watch
 
     def _deliver(self, senders: Sequence[Any], frame: Frame | None) -> None:
@@ -414,8 +416,13 @@ class PlanBus(SimulatedBus):
     def _disturbed(
         self, frame: Frame, word: plans.Sender, sender: Any, now: float
     ) -> Sequence[Frame]:
+        def arrive(late: Frame, at: float) -> None:
+            self._carry(late, [sender], at)
+            if word == "device":
+                self.on_late(at)
+
         def arrive_later(late: Frame, after_s: float) -> None:
-            self.agenda.at(now + after_s, lambda at: self._carry(late, [sender], at))
+            self.agenda.at(now + after_s, lambda at: arrive(late, at))
 
         frames = [frame]
         for fault in tuple(self.frame_faults):

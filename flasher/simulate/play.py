@@ -167,6 +167,7 @@ class Player:
         """Last message that the host began."""
         self._reached: set[str] = set()
         self._facts = Facts(plan, self.target.request_id, WireRules(plan))
+        self.bus.on_late = self._facts.rules.delayed_frame_arrives
         self._at_update: list[Unit] = []
         """Units on the bus when the last update command began."""
         if bench is None:

@@ -251,6 +251,10 @@ class WireRules:
             self._break("two update commands with less than 30 ms between them")
         self._updated_at = now
 
+    def delayed_frame_arrives(self, now: float) -> None:
+        """Note a frame of a device that arrives later than the bus carried it."""
+        self._heard_at = now
+
     def others_send(self, frame: Frame, now: float) -> None:
         """Note a frame of a device, of another tool, or of other traffic."""
         data = frame.data

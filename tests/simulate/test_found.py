@@ -128,6 +128,12 @@ def test_frames_that_a_killed_process_left_in_its_adapter_are_those_of_a_host() 
         "job packets=10 image=471 ; mock ; @packet2 unsolicited what=boot",
         # A question in which this computer paused is sent again.
         "job packets=3 gap=0.052 ; @0.144301 stall seconds=0.076924",
+        # The answer to the first copy of a packet arrives late, after the second copy.
+        "job packets=4 ; mock ; @packet2+0.0075 delay count=8 seconds=0.425",
+        """
+        job packets=8 gap=0.028 ; mock program_time_s=0.136398
+        @packet4 tool count=5 every=1.189281 ; @packet4 delay sender=device count=2 seconds=1.266394
+        """,
         # Two restarts of a device whose application answers no query: two bursts, then silence.
         """
         job packets=3 image=952 ; independent after_complete=restarts answers=false
