@@ -26,7 +26,6 @@ from flasher.simulate.independent import (
     NAK,
     REPORT,
     REQUEST,
-    UPDATE,
     IndependentDevice,
     frames_of,
 )
@@ -39,7 +38,6 @@ INBOX_FRAMES: Final = 4096
 ERROR_FRAME: Final = Frame(0x088, bytes.fromhex("0000020000000000"), is_error=True)
 """Form error of the bus, as Linux reports it."""
 _ROUNDING_S: Final = 1e-9
-_UPDATE: Final = UPDATE.to_bytes(2, "big")
 _HEADER, _GENERAL_FEEDBACK = b"\x55\xaa", FEEDBACK.to_bytes(2, "big")
 _BOOT_VERSION: Final = BOOT_VERSION.to_bytes(2, "big")
 _REQUEST: Final = REQUEST.to_bytes(2, "big")
@@ -556,8 +554,8 @@ class PlanLink(SimulatedLink):
         self._random = random.Random(adapter.seed)
         self._stalls_until = -inf
         self._suffers = self._is_killed = self._is_overdue = False
-        self.on_update: Callable[[float], None] = lambda _now: None
-        """Called when an update command is handed to the adapter."""
+        self.on_send: Callable[[Frame, float], None] = lambda _frame, _now: None
+        """Called when a frame is handed to the adapter."""
         bus.host = self
         bus.agenda.at(overdue_at, self._end)
 
@@ -603,8 +601,7 @@ class PlanLink(SimulatedLink):
             self._suffer()
         super().send(frame)
         self._echoes.sent(frame)
-        if frame.data[4:6] == _UPDATE and frame.data[:2] == _HEADER:
-            self.on_update(self._plan_bus.clock.now())
+        self.on_send(frame, self._plan_bus.clock.now())
 
     def receive(self, deadline: float) -> Frame | None:
         if self._suffers:

@@ -534,7 +534,7 @@ class Player:
         """Run the command once; None if its process was killed."""
         self._phase = "idle"
         self._link = link = PlanLink(self.bus, self.plan.adapter, overdue_at)
-        link.on_update = self._facts.rules.update_handed_over
+        link.on_send = self._facts.rules.host_hands_over
         self._interrupted_at = None
         clock = HostClock(self.bus, is_disturbed=self._disturbs_host and self._is_running)
         device = api.Connection(link, clock, "the bus of the plan").device(self.target)

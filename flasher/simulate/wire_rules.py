@@ -6,6 +6,7 @@ the host's doing, as a bus that is full.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
@@ -40,6 +41,8 @@ _CAUSES_REPETITION: Final = (
     plans.Kill, plans.Restart, plans.Power, plans.Hang, plans.Unplug, plans.BusOff,
 )  # fmt: skip
 _DELAYS_FRAMES: Final = (plans.Load, plans.Unplug, plans.BusOff, plans.Tool)
+_PACKET_WIRE_S: Final = 0.008
+"""Shortest time of a packet on the bus."""
 _ERASURES_MAX: Final = 20
 """Erasures after which an upgrade ends (docs/explanation/upgrade.md)."""
 _TOOL_QUIET_S: Final = 2.0
@@ -111,6 +114,8 @@ class WireRules:
         """No packet was sent since the last update command."""
         self._requests = 0
         """Requests for the transfer since then."""
+        self._in_adapter: deque[tuple[bytes, float]] = deque()
+        """Frames that the host's adapter has not sent yet, with the times at which it took them."""
         self._heads: dict[bytes, float] = {}
         """First frames of the host's messages, with their times."""
         self._sent_twice: set[bytes] = set()
@@ -123,9 +128,9 @@ class WireRules:
         self._ended_at = float("-inf")
         self._acknowledged: dict[int, float] = {}
         self._packet: tuple[int, float] | None = None
-        """Low byte of the number of the packet sent last, and its end."""
+        """Low byte of the number of the packet sent last, and when it left for the host."""
         self._packet_begun_at = self._heard_at = float("-inf")
-        self._updated_at = float("-inf")
+        self._updated_at = self._head_taken_at = float("-inf")
         self._number = 0
 
     @property
@@ -142,6 +147,7 @@ class WireRules:
         """Check a frame of the host; return the message that begins with it."""
         data = frame.data
         gap_s, self._ended_at = now - self._ended_at, now
+        taken_at = self._leaves_adapter(data, now)
         # As a reassembler knows it: an image may contain the first two bytes (2.2.1).
         is_head = len(data) == 8 and data[:2] == b"\x55\xaa" and data[3] == data[5] + COMMAND_SIZE
         name = _COMMANDS.get(data[4:6]) if is_head and data[2] == WRITE else None
@@ -159,7 +165,7 @@ class WireRules:
                     self._break("a message goes on after a gap in which the device dropped it")
                 self._had_gap = gap_s > limit_s
                 self._left -= len(data)
-                self._end_message(now)
+                self._end_message(now, taken_at)
             return None
         is_short = gap_s < DEFAULT_TIMINGS.inter_frame_timeout_s - _TOLERANCE_S
         # The device dropped a message whose rest came after a gap.
@@ -169,14 +175,14 @@ class WireRules:
         # A pause cut it: what came meanwhile answers it as well.
         is_begun_again = self._left > 0 and (name, number) == (self._kind, self._number)
         self._kind, self._number, self._had_gap = name or "", number, False
-        self._left = data[3] + OVERHEAD_SIZE - len(data)
+        self._left, self._head_taken_at = data[3] + OVERHEAD_SIZE - len(data), taken_at
         if name is None:
             return None
         if now - self._heads.get(data, float("-inf")) <= _ECHOED_S:
             self._sent_twice.add(data)
         self._heads[data] = now
         self._check_begin(name, number, now, is_begun_again=is_begun_again)
-        self._end_message(now)
+        self._end_message(now, taken_at)
         return Begun(name, number)
 
     def _check_begin(self, name: str, number: int, now: float, *, is_begun_again: bool) -> None:
@@ -233,23 +239,36 @@ class WireRules:
             if is_early and self._checks_times and not is_answered:
                 self._break("a packet is sent again before its answer is late")
 
-    def _end_message(self, now: float) -> None:
+    def _end_message(self, now: float, taken_at: float) -> None:
         if self._left > 0:
             return
         self._left = 0
         if self._kind == "packet":
-            self._packet = (self._number, now)
+            # The host does not know how long its frames wait for those before them (R12).
+            left_at = max(self._head_taken_at + _PACKET_WIRE_S, taken_at)
+            self._packet = (self._number, min(left_at, now))
         elif self._kind == "end":
             if not self.ends:
                 self._announced_at = float("-inf")
             self.ends += 1
             self.has_version_answer = False
 
-    def update_handed_over(self, now: float) -> None:
-        """Check an update command that the host hands to its adapter."""
-        if now - self._updated_at < DEFAULT_TIMINGS.update_spacing_s - _TOLERANCE_S:
-            self._break("two update commands with less than 30 ms between them")
-        self._updated_at = now
+    def host_hands_over(self, frame: Frame, now: float) -> None:
+        """Check a frame that the host hands to its adapter."""
+        data = frame.data
+        self._in_adapter.append((data, now))
+        if data[:2] == b"\x55\xaa" and _COMMANDS.get(data[4:6]) == "update":
+            if now - self._updated_at < DEFAULT_TIMINGS.update_spacing_s - _TOLERANCE_S:
+                self._break("two update commands with less than 30 ms between them")
+            self._updated_at = now
+
+    def _leaves_adapter(self, data: bytes, now: float) -> float:
+        """Return when the adapter took a frame that has left; now for one of a killed process."""
+        for index, (each, taken_at) in enumerate(self._in_adapter):
+            if each == data:
+                del self._in_adapter[index]
+                return taken_at
+        return now
 
     def delayed_frame_arrives(self, now: float) -> None:
         """Note a frame of a device that arrives later than the bus carried it."""
@@ -271,6 +290,8 @@ class WireRules:
         is_told_apart = sent_at is None or (self._has_all_echoes and now - sent_at > _ECHOED_S)
         # Its second echo may have been taken for a copy of the first: another one is expected.
         is_told_apart &= data not in self._sent_twice
+        # The host takes it for the echo of its own frame, which still waits in the adapter.
+        is_told_apart &= all(each != data for each, _ in self._in_adapter)
         if data[2] == WRITE and is_told_apart:
             self._tool_at = now
 

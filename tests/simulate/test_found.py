@@ -134,6 +134,13 @@ def test_frames_that_a_killed_process_left_in_its_adapter_are_those_of_a_host() 
         job packets=8 gap=0.028 ; mock program_time_s=0.136398
         @packet4 tool count=5 every=1.189281 ; @packet4 delay sender=device count=2 seconds=1.266394
         """,
+        # Copies of a packet wait in an adapter that is alone on the bus.
+        """
+        job packets=4 others=false ; independent restart=0.771168
+        @packet2+0.0025 power seconds=1.113372
+        """,
+        # Another tool sends the same update command at the same time.
+        "job packets=3 ; @0.2848 tool does=updates",
         # Two restarts of a device whose application answers no query: two bursts, then silence.
         """
         job packets=3 image=952 ; independent after_complete=restarts answers=false
