@@ -39,6 +39,7 @@ _LIMITS: Final[dict[object, tuple[float, float]]] = {
 Count = Annotated[int, (1, 1000)]
 Interval = Annotated[float, (0.0001, 3600)]
 Share = Annotated[float, (0, 1)]
+Seed = Annotated[int, (0, math.inf)]
 Sender = Literal["any", "host", "device"]
 _NUMBERED: Final = ("packet", "frame", "flash")
 _SECONDS: Final = r"\d+(?:\.\d+)?(?:e[+-]?\d+)?"
@@ -130,7 +131,7 @@ class Adapter(Clause):
     """Share that comes twice."""
     queue: Count = DEFAULT_QUEUE_FRAMES
     """Frames that wait to be sent; a full queue takes no more."""
-    seed: int = 1
+    seed: Seed = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,7 +257,7 @@ class Noise(Clause):
     wrong: Share = 0.0
     doubled: Share = 0.0
     errors: Share = 0.0
-    seed: int = 1
+    seed: Seed = 1
 
 
 # -- faults of devices -----------------------------------------------------------------------------
