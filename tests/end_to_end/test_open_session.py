@@ -22,13 +22,19 @@ from flasher.protocol.spec import BMS, TARGETS, Mode, Node, can_id
 from flasher.protocol.wire import Message, encode, split
 from flasher.settings.manifest import release_of
 from flasher.settings.profile import VersionQuery
-from tests.campaigns.lost_contact import STUBBORN
 from tests.end_to_end.stage import IMAGE, SMALL, Speaker, Stage
 from tests.loops import each
 
 UPDATE = bytes.fromhex("55AA160DA10B")
 OPEN = UpgradeOptions(in_session=True)
 RESCUE = UpgradeOptions(in_session=True, at_power_up=True)
+STUBBORN = replace(
+    SMALL,
+    pause_in_transfer="waits",
+    reset_in_bootloader="ignored",
+    reset_in_transfer="ignored",
+    update_in_transfer="starts_over",
+)
 
 
 class Killed(BaseException):

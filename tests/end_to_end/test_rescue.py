@@ -23,11 +23,10 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BOOT_VERSION_BURST
 from flasher.wording import wording
 from tests.end_to_end.stage import IMAGE, NEW, SMALL, Stage, image_of
-from tests.loops import each
+from tests.loops import each, sample
 
 PACKETS = 40
-SAMPLE = (1, 2, 3, 20, 21, PACKETS - 1, PACKETS)
-"""`python -m tests.campaigns.rescues` loses every packet."""
+SAMPLE = sample((1, 2, 3, 20, 21, PACKETS - 1, PACKETS), range(1, PACKETS + 1))
 LONG = image_of(PACKETS)
 ONCE = UpgradeOptions(attempts=1)
 LISTENS = replace(SMALL, without_application="listens")
