@@ -16,7 +16,13 @@ from pydantic.json_schema import CoreRef, DefsRef, GenerateJsonSchema, JsonSchem
 from pydantic_core import core_schema
 
 from flasher import events
-from flasher.cli.documents import SCHEMA_VERSION, Envelope, ErrorDocument, adapter
+from flasher.cli.documents import (
+    SCHEMA_VERSION,
+    Envelope,
+    ErrorDocument,
+    adapter,
+    descriptions,
+)
 from flasher.cli.main import COMMANDS
 
 DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
@@ -74,11 +80,13 @@ def build() -> Schema:
         lines += getattr(module, "LINES", ())
     documents = {command: tuple(module.DOCUMENTS) for command, module in modules.items()}
     described = [*lines, *(each for each in documents.values() for each in each), ErrorDocument]
-    schemas, shared = TypeAdapter.json_schemas(
-        [(each, "serialization", adapter(each)) for each in dict.fromkeys([Envelope, *described])],
-        ref_template="#/$defs/{model}",
-        schema_generator=_Generator,
-    )
+    with descriptions():
+        wanted = dict.fromkeys([Envelope, *described])
+        schemas, shared = TypeAdapter.json_schemas(
+            [(each, "serialization", adapter(each)) for each in wanted],
+            ref_template="#/$defs/{model}",
+            schema_generator=_Generator,
+        )
     known: Schema = shared.get("$defs", {})
 
     def table(kind: type) -> Schema:
@@ -108,9 +116,10 @@ def build() -> Schema:
 
 
 def schema_of(kind: Any) -> Schema:
-    return adapter(kind).json_schema(
-        mode="serialization", schema_generator=_Generator, ref_template="#/$defs/{model}"
-    )
+    with descriptions():
+        return adapter(kind).json_schema(
+            mode="serialization", schema_generator=_Generator, ref_template="#/$defs/{model}"
+        )
 
 
 def event_classes() -> list[type]:

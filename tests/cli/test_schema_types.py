@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import dataclass
 from enum import Enum, IntEnum, StrEnum
 from functools import cached_property
@@ -10,7 +11,7 @@ from typing import Literal
 import pytest
 from pydantic import PydanticUserError, TypeAdapter, ValidationError
 
-from flasher.cli.documents import as_json
+from flasher.cli.documents import adapter, as_json
 from flasher.cli.schema import schema_of
 from flasher.validation import LowerCaseInJson, json_keys
 from tests.schema_document import mismatches
@@ -61,6 +62,17 @@ THING = Thing(
     {"p": Point(1.0, "p")},
     b"\x00\xff",
 )
+
+
+def test_descriptions_are_collected_for_schemas_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They take most of the time of a short command; a process may print JSON before a schema."""
+    adapter.cache_clear()
+    with monkeypatch.context() as patched:
+        patched.setattr(inspect, "findsource", None)
+        assert as_json(Point(0.5, None)) == {"x_m": 0.5, "name": None}
+        assert as_json(THING)["by_name"] == {"p": {"x_m": 1.0, "name": "p"}}
+    described = schema_of(Thing)["$defs"]["Point"]["properties"]["x_m"]
+    assert described["description"] == "To the right."
 
 
 def test_a_dataclass_becomes_a_closed_object_with_its_texts() -> None:

@@ -121,7 +121,8 @@ def run(
             is_temporary=_is_temporary(options, records), has_scans=scans is not None,
         )  # fmt: skip
         first = 1
-        if is_virtual:  # serial numbers that are not in the records yet
+        # Serial numbers that are not in the records yet.
+        if is_virtual and not _is_temporary(options, records):
             start = number_of_first(config.name) if config.plant else 1
             first = max(
                 next_number(
