@@ -7,7 +7,6 @@ import hashlib
 import multiprocessing
 import os
 import signal
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -199,7 +198,7 @@ def _begin_process() -> None:
 def _run_each(run_one: RunBatch, pipe: Connection, run_s: float) -> None:
     """In the process: run what comes through the pipe; anything that comes meanwhile is a stop."""
     _begin_process()
-    if sys.implementation.name == "cpython":
+    if hasattr(gc, "freeze"):  # PyPy has none
         gc.freeze()  # the modules do not become garbage: looking through them takes 5 % of a run
     while True:
         try:
