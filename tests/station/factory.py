@@ -11,6 +11,7 @@ from datetime import UTC, date, datetime, timedelta
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from sqlalchemy import event
 
@@ -18,6 +19,7 @@ from flasher.image.image import Image
 from flasher.protocol.spec import BMS, OBC, WMC, Target
 from flasher.settings.manifest import release_of, to_toml
 from flasher.station.recipe_file import LoadedRecipe, load_checked
+from flasher.station.records import database
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import (
     Claim,
@@ -141,16 +143,16 @@ class Bench:
         self.store.recover()
 
     def opened(self, station: str = "line-2", lock_timeout_s: float | None = None) -> Store:
-        store = Store.open(
-            str(self.path),
-            station=station,
-            clock=self.clock,
-            key_locations=self.key_locations,
-            lock_timeout_s=lock_timeout_s or self.lock_timeout_s,
-        )
         # These tests pull no plug, and share the disk with each other.
+        with patch.object(database, "_SYNCHRONOUS_FULL", 0):
+            store = Store.open(
+                str(self.path),
+                station=station,
+                clock=self.clock,
+                key_locations=self.key_locations,
+                lock_timeout_s=lock_timeout_s or self.lock_timeout_s,
+            )
         event.listen(store.database.engine, "connect", _do_not_wait_for_the_disk)
-        store.database.close()
         return store
 
     @property
