@@ -46,6 +46,7 @@ def codes_of(bug: Bug) -> dict[FunctionType, CodeType]:
     return {each: each.__code__ for file in files for each in functions_of(file)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bug", BUGS, ids=lambda bug: bug.name)
 def test_a_mistake_is_in_the_process_until_the_end_of_its_block(bug: Bug) -> None:
     codes = bug.codes()

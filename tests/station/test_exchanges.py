@@ -420,6 +420,7 @@ def test_another_bootloader_after_the_second_restart(tmp_path: Path) -> None:
     assert "V1.0.0 before, and V1.0.1 now" in result.text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pulled_after_s", [0.2, 0.5, 0.9])
 @pytest.mark.parametrize("gap_s", [0.3, 1.0, 3.5])
 def test_a_unit_that_comes_while_the_one_in_its_bootloader_is_erased(
@@ -656,6 +657,7 @@ def test_a_unit_that_stays_passes(tmp_path: Path, text: str, change: dict[str, o
     assert result.outcome is RunState.PASS, result
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reset_delay_s", [0.0, 0.5, 2.0])
 @pytest.mark.parametrize("reset", ["ignored", "restarts"])
 @pytest.mark.parametrize("has_application", [True, False])
@@ -679,6 +681,7 @@ def without_application(**profile: object) -> MockDevice:
     return MockDevice(BMS, bitrate_bps=250_000, profile=profile_of_it, has_application=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stall_s", [0.1, 0.14, 0.16, 0.2, 0.23, 0.24])
 @pytest.mark.parametrize("kind", [RunKind.PRODUCTION, RunKind.RECHECK])
 def test_a_computer_that_stands_still_for_a_moment_is_no_pause_of_a_bootloader(
@@ -691,6 +694,7 @@ def test_a_computer_that_stands_still_for_a_moment_is_no_pause_of_a_bootloader(
     assert result.outcome is RunState.PASS, result
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stall_s", [0.4, 1.0, 10.0])
 @pytest.mark.parametrize("reset", ["ignored", "restarts"])
 @pytest.mark.parametrize("has_application", [True, False])
@@ -713,6 +717,7 @@ def test_what_a_computer_that_stands_still_did_not_see_does_not_accuse_the_unit(
         assert bench.run().code == "OK"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap_s", [0.1, 0.3, 1.0])
 @pytest.mark.parametrize("note", BETWEEN[:3], ids=" ".join)
 def test_units_in_their_bootloaders_that_change_places_while_nobody_listens(
@@ -766,6 +771,7 @@ def test_a_bootloader_may_announce_itself_at_a_pace_of_its_own(
     assert result.outcome is RunState.PASS, result
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap_s", [0.3, 1.0, 3.5])
 @pytest.mark.parametrize("pulled_after_s", [0.0, 0.02, 0.05, 0.1, 0.15, 0.2])
 def test_a_unit_in_its_bootloader_that_is_exchanged_as_its_flash_begins(

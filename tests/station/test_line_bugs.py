@@ -17,6 +17,7 @@ AT_HOME = ("STUCK", "TRUSTED")
 each_bug = pytest.mark.parametrize("bug", BUGS, ids=lambda bug: bug.name)
 
 
+@pytest.mark.slow
 @each_bug
 def test_a_planted_bug_applies(bug: LineBug) -> None:
     assert bug.codes()
