@@ -1,4 +1,4 @@
-"""Documents of `--json`: their types, and conversion of values to JSON.
+"""Documents of `--json`: their types, and what they are made of.
 
 A type that a command prints is printed as it is, or with the keys of
 `flasher.validation.json_keys`. Only a view that differs from it is a document, a frozen dataclass
@@ -10,67 +10,19 @@ lines before the document as `LINES`. `flasher.cli.output` puts them into the `E
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
-from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
+from typing import Any, TypeVar, cast
 
+from flasher.documents import as_json
 from flasher.errors import ErrorCode, ExitCode, Fault
 from flasher.events import QueryAnswered
 from flasher.image.cortexm import VectorTable
 from flasher.image.image import AddressSpan
 from flasher.protocol.fields import Content
 
-if TYPE_CHECKING:
-    from pydantic import ConfigDict, TypeAdapter
-
-SCHEMA_VERSION: Final = 2
-"""Incremented when a field of any document changes its meaning or is removed; not for a new one."""
-
 Kind = TypeVar("Kind")
 FieldValue = str | int | list[int] | list[str] | None
 """Value of a message field: bytes are in hexadecimal, flags are a list of names."""
-
-
-_CONFIG: Final[ConfigDict] = {
-    "ser_json_bytes": "hex",
-    "alias_generator": lambda name: name.rstrip("_"),
-    "serialize_by_alias": True,
-}
-
-
-@cache
-def adapter(kind: Any) -> TypeAdapter[Any]:
-    """Create the pydantic adapter of a type: enumerations as their words, bytes in hexadecimal. A
-    field `from_` is the key `from`.
-    """
-    from pydantic import TypeAdapter, with_config  # noqa: PLC0415  for JSON only
-
-    if dataclasses.is_dataclass(kind):
-        described: Any = with_config(_CONFIG)(cast("Any", kind))
-        return TypeAdapter(described)
-    return TypeAdapter(kind, config=_CONFIG)
-
-
-@contextmanager
-def descriptions() -> Iterator[None]:
-    """Context manager in which adapters have the docstrings of fields, for schemas. Adapters for
-    JSON alone have none: most of the time would be spent on finding them.
-    """
-    adapter.cache_clear()
-    _CONFIG["use_attribute_docstrings"] = True  # of the classes with this configuration, too
-    try:
-        yield
-    finally:
-        del _CONFIG["use_attribute_docstrings"]
-        adapter.cache_clear()
-
-
-def as_json(document: object) -> Any:
-    """Convert a document, an event or a part of one to plain JSON values."""
-    kind: Any = type(document)
-    return adapter(kind).dump_python(document, mode="json")
 
 
 def document_of(kind: type[Kind], source: object, /, **others: Any) -> Kind:

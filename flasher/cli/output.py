@@ -19,14 +19,13 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TextIO
 
 from flasher.cli.documents import (
-    SCHEMA_VERSION,
     Envelope,
     ErrorDocument,
-    as_json,
     document_of,
     to_json,
 )
 from flasher.cli.terminal import columns, painted, takes_colour, unpainted, wrapped
+from flasher.documents import SCHEMA_VERSION, as_json
 from flasher.errors import ErrorCode, ExitCode, FlasherError, UsageError
 
 if TYPE_CHECKING:

@@ -12,50 +12,21 @@ from types import ModuleType
 from typing import Any, Final
 
 from pydantic import TypeAdapter
-from pydantic.json_schema import CoreRef, DefsRef, GenerateJsonSchema, JsonSchemaMode
+from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import core_schema
 
 from flasher import events
-from flasher.cli.documents import (
-    SCHEMA_VERSION,
-    Envelope,
-    ErrorDocument,
-    adapter,
-    descriptions,
-)
+from flasher.cli.documents import Envelope, ErrorDocument
 from flasher.cli.main import COMMANDS
+from flasher.documents import SCHEMA_VERSION, adapter, descriptions
 
 DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
 _REFERENCE: Final = re.compile(r'"#/\$defs/([^"]+)"')
 Schema = dict[str, Any]
 
 
-_PUBLISHED: Final = {
-    "flasher.bus.health.LinkHealth": "HealthDocument",
-    "flasher.conformance.results.CaseResult": "ResultDocument",
-    "flasher.conformance.results.Histogram": "HistogramDocument",
-    "flasher.conformance.results.KeyAnswer": "AnswerDocument",
-    "flasher.conformance.results.RunReport": "ReportDocument",
-    "flasher.conformance.results.Times": "TimesDocument",
-    "flasher.conformance.results.WalkFinding": "FindingDocument",
-    "flasher.conformance.results.StepCoverage": "CoverageDocument",
-    "flasher.host.outcome.Outcome": "OutcomeDocument",
-    "flasher.host.write.FieldChange": "ChangeDocument",
-    "flasher.image.image.AddressSpan": "SegmentDocument",
-    "flasher.mock.variants.base.Variant": "VariantDocument",
-    "flasher.station.records.model.ReportedRun": "ReportedRunDocument",
-}
-"""Types whose definitions were published under another name than their own."""
-
-
 class _Generator(GenerateJsonSchema):
     """Requires every field of a document, and forbids others."""
-
-    def get_defs_ref(self, core_mode_ref: tuple[CoreRef, JsonSchemaMode]) -> DefsRef:
-        ref, mode = core_mode_ref
-        path, _, identity = ref.partition(":")
-        ref = CoreRef(f"{_PUBLISHED.get(path, path)}:{identity}")
-        return super().get_defs_ref((ref, mode))
 
     def field_title_should_be_set(self, schema: Any) -> bool:
         return False

@@ -4,24 +4,27 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime, time
 from typing import Final
 
 from sqlalchemy import Connection, text
 
-from flasher.station.records.model import RunKind, RunState, utc_moment, utc_text
+from flasher.station.records.model import Moment, RunKind, RunState, Units, utc_moment, utc_text
 from flasher.station.shift_counts import shift_began
 from flasher.validation import json_keys
 
 _YIELDS: Final = text(f"""
-SELECT station, count(last), coalesce(sum(last % 2), 0), count(shift_last),
-    coalesce(sum(shift_last % 2), 0)
+SELECT station, count(last), coalesce(sum(last % 2), 0), coalesce(sum(first % 2), 0),
+    count(shift_last), coalesce(sum(shift_last % 2), 0), coalesce(sum(shift_first % 2), 0)
 FROM (
-    SELECT n.name AS station, r.unit_id, max(r.ranked) FILTER (WHERE r.begun_at >= :day) AS last,
+    SELECT n.name AS station, r.unit_id,
+        min(r.ranked) FILTER (WHERE r.begun_at >= :day) AS first,
+        max(r.ranked) FILTER (WHERE r.begun_at >= :day) AS last,
+        min(r.ranked) FILTER (WHERE r.begun_at >= :shift) AS shift_first,
         max(r.ranked) FILTER (WHERE r.begun_at >= :shift) AS shift_last
     FROM (
-        -- Two for each run, and one for PASS: the greatest is that of the last run.
+        -- Two for each run, and one for PASS: the least is that of the first run.
         SELECT socket_id, unit_id, begun_at, id * 2 + (state = 'PASS')::int AS ranked FROM run
         WHERE begun_at >= :since AND state IN ('PASS', 'FAIL') AND kind <> '{RunKind.GOLDEN}'
     ) r JOIN socket s ON s.id = r.socket_id JOIN station n ON n.id = s.station_id
@@ -37,21 +40,6 @@ FROM socket s JOIN station n ON n.id = s.station_id CROSS JOIN LATERAL (
 """)  # noqa: S608  a constant
 
 
-@json_keys("units passed share")
-@dataclass(frozen=True)
-class Yield:
-    """Units with a verdict in a period, without golden ones."""
-
-    units: int = 0
-    passed: int = 0
-    """Units whose last run with a verdict is a PASS."""
-
-    @property
-    def share(self) -> float | None:
-        """From 0 to 1; None without units."""
-        return self.passed / self.units if self.units else None
-
-
 @dataclass(frozen=True)
 class RecentRun:
     """One of the last runs of a socket."""
@@ -60,7 +48,7 @@ class RecentRun:
     serial: str
     state: RunState
     code: str
-    begun_at: datetime
+    begun_at: Moment
 
 
 @dataclass(frozen=True)
@@ -76,8 +64,8 @@ class SocketRuns:
 class Activity:
     """What a station has done lately, without golden units."""
 
-    shift: Yield = Yield()
-    day: Yield = Yield()
+    shift: Units = field(default_factory=Units)
+    day: Units = field(default_factory=Units)
     sockets: tuple[SocketRuns, ...] = ()
 
     @property
@@ -96,9 +84,10 @@ def activities(
     shift = shift_began(shifts, now) or day
     moments = {"day": day, "shift": shift, "since": min(day, shift)}
     values = {name: utc_text(moment) for name, moment in moments.items()}
-    yields: dict[str, tuple[Yield, Yield]] = {}
-    for station, units, passed, *of_shift in connection.execute(_YIELDS, values):
-        yields[station] = Yield(*of_shift), Yield(units, passed)
+    yields: dict[str, tuple[Units, Units]] = {}
+    for station, *sums in connection.execute(_YIELDS, values):
+        counts = [int(each) for each in sums]
+        yields[station] = Units(*counts[3:]), Units(*counts[:3])
     sockets: dict[str, dict[str, list[RecentRun]]] = defaultdict(lambda: defaultdict(list))
     for row in connection.execute(_LAST, {"runs": runs}):
         made = RecentRun(
@@ -107,7 +96,7 @@ def activities(
         sockets[row.station][row.socket].append(made)
     return {
         station: Activity(
-            *yields.get(station, (Yield(), Yield())),
+            *yields.get(station, (Units(), Units())),
             tuple(SocketRuns(name, tuple(some)) for name, some in of_station.items()),
         )
         for station, of_station in sockets.items()

@@ -179,7 +179,7 @@ def _unsent(status: StationStatus, bounds: Bounds) -> StationCheck:
 
 def _yield(activity: Activity, bounds: Bounds) -> StationCheck:
     kind, shift = CheckKind.YIELD, activity.shift
-    if shift.units < bounds.units_min or shift.share is None:
+    if shift.units < bounds.units_min or shift.yield_share is None:
         sentence = text(
             "too few units in this shift: {count} of {least}",
             count=shift.units,
@@ -189,7 +189,7 @@ def _yield(activity: Activity, bounds: Bounds) -> StationCheck:
     sentence = text(
         "{passed} of {units} units of this shift passed", passed=shift.passed, units=shift.units
     )
-    return _check(kind, sentence, is_alert=shift.share < bounds.yield_min)
+    return _check(kind, sentence, is_alert=shift.yield_share < bounds.yield_min)
 
 
 def _repeated(now: datetime, activity: Activity, bounds: Bounds) -> StationCheck:

@@ -18,6 +18,7 @@ from sqlalchemy import Connection, text
 
 from flasher.errors import UsageError
 from flasher.plant.central import Central
+from flasher.station.records.model import RunState
 
 RELEASES_MAX: Final = 100
 """Releases that are listed."""
@@ -90,7 +91,7 @@ class ReleasedClaim:
     reason: str
     run_id: int | None
     """The run with this claim, if its station has sent it after all."""
-    outcome: str | None
+    outcome: RunState | None
     """Null also where the run was retired."""
 
 
@@ -106,7 +107,10 @@ def releases_of(connection: Connection, chosen: ClaimFilter) -> list[ReleasedCla
     where, values = _conditions(chosen)
     query = text(_RELEASES.format(where=where))
     rows = connection.execute(query, {**values, "limit": RELEASES_MAX})
-    return [ReleasedClaim(**row) for row in rows.mappings()]
+    return [
+        ReleasedClaim(**{**row, "outcome": row["outcome"] and RunState(row["outcome"])})
+        for row in rows.mappings()
+    ]
 
 
 def release(central: Central, chosen: ClaimFilter, reason: str) -> int:

@@ -72,8 +72,6 @@ class Courier:
 
     url: str
     receivers: Sequence[Receiver]
-    schema: int
-    """Version of the schema of documents."""
     report: Callable[[Attempt, Answer], None] = lambda _attempt, _answer: None
     say: Callable[[str], None] = lambda _text: None
     begun: Callable[[], None] = lambda: None
@@ -151,9 +149,7 @@ class Courier:
 
     async def _attempt(self, receiver: str, station: str, number: int) -> None:
         """Try to deliver a run. Raises _NotSettledError, RecordError."""
-        attempt = await asyncio.to_thread(
-            self._deliveries.begin, receiver, UUID(station), number, self.schema
-        )
+        attempt = await asyncio.to_thread(self._deliveries.begin, receiver, UUID(station), number)
         if attempt is None:
             return
         answer = await self._transports[receiver].send(attempt.key, attempt.document)

@@ -9,9 +9,9 @@ from enum import StrEnum
 from typing import Final
 from uuid import UUID
 
-from pydantic import TypeAdapter
 from sqlalchemy import Connection, text
 
+from flasher.documents import SCHEMA_VERSION, adapter
 from flasher.errors import UsageError
 from flasher.plant.central import Central
 from flasher.plant.claim_list import released_runs
@@ -21,6 +21,7 @@ from flasher.station.records.errors import NotFoundError
 from flasher.station.records.model import RELEASED_MARK, RunDetails
 from flasher.station.records.queries import details_of
 from flasher.station.records.schema import run
+from flasher.validation import json_keys
 
 HEARTBEAT_S: Final = 5.0
 SILENCE_MAX_S: Final = 20.0
@@ -128,12 +129,11 @@ def parse_key(key: str) -> tuple[UUID, int]:
     return found
 
 
+@json_keys("schema key station_id row run")
 @dataclass(frozen=True)
 class RunDocument:
     """A run as receivers get it."""
 
-    schema: int
-    """Schema of the documents of --json."""
     key: str
     """The same for ever, and different for each run: a receiver that has it already ignores this
     document."""
@@ -143,8 +143,10 @@ class RunDocument:
     """Row of the audit trail that states the end of the run."""
     run: RunDetails
 
-
-_DOCUMENT: Final = TypeAdapter(RunDocument)
+    @property
+    def schema(self) -> int:
+        """Schema of the documents of --json."""
+        return SCHEMA_VERSION
 
 
 @dataclass(frozen=True)
@@ -176,15 +178,15 @@ class Deliveries:
             for name in receivers:
                 connection.execute(_REGISTER, {"name": name})
 
-    def begin(self, receiver: str, station: UUID, number: int, schema: int) -> Attempt | None:
+    def begin(self, receiver: str, station: UUID, number: int) -> Attempt | None:
         """Record that a run is being sent, and make its document; None if it is settled."""
         of = {"receiver": receiver, "station": station, "number": number}
         with self._central.writing() as connection:
             attempt = connection.execute(_BEGIN, of).scalar_one_or_none()
             if attempt is None:
                 return None
-            made = document_of(connection, station, number, schema)
-        return Attempt(receiver, station, number, attempt, _DOCUMENT.dump_json(made))
+            made = document_of(connection, station, number)
+        return Attempt(receiver, station, number, attempt, adapter(RunDocument).dump_json(made))
 
     def end(self, attempt: Attempt, answer: Answer) -> None:
         """Record the result of an attempt."""
@@ -206,11 +208,11 @@ class Deliveries:
 
     # -- what people do ---------------------------------------------------------------------------
 
-    def document(self, key: str, schema: int) -> RunDocument:
+    def document(self, key: str) -> RunDocument:
         """The document of a run as it is sent. Raises UsageError, NotFoundError."""
         station, number = parse_key(key)
         with self._central.reading() as connection:
-            return document_of(connection, station, number, schema)
+            return document_of(connection, station, number)
 
     def keys(self, receiver: str) -> dict[str, DeliveryState]:
         """Keys of all deliveries to a receiver, with their states."""
@@ -248,7 +250,7 @@ def unknown_receiver(name: str) -> UsageError:
     )
 
 
-def document_of(connection: Connection, station: UUID, number: int, schema: int) -> RunDocument:
+def document_of(connection: Connection, station: UUID, number: int) -> RunDocument:
     """Make the document of the run that ended with a row of a chain. Raises NotFoundError."""
     key = key_of(station, number)
     run_id = connection.execute(_RUN_OF, {"station": station, "number": number}).scalar()
@@ -256,5 +258,5 @@ def document_of(connection: Connection, station: UUID, number: int, schema: int)
         ended = details.run
         if run_id in released_runs(connection):
             ended = replace(ended, duplicates=RELEASED_MARK)
-        return RunDocument(schema, key, station, number, replace(details, run=ended))
+        return RunDocument(key, station, number, replace(details, run=ended))
     raise NotFoundError(f"There is no run with the key {key}.")

@@ -11,6 +11,7 @@ from typing import Any, Final
 from sqlalchemy import Connection, text
 
 from flasher.plant.deliveries import DeliveryState, key_of, parse_key
+from flasher.station.records.model import RunState
 from flasher.station.records.newest import PageCursor
 from flasher.station.records.overview import Page, page_of
 
@@ -102,7 +103,7 @@ class Delivery:
     station: str
     serial: str
     part: str
-    outcome: str
+    outcome: RunState
     is_virtual: bool
 
 
@@ -190,4 +191,5 @@ def _row_at(connection: Connection, moment: datetime, later: timedelta) -> int:
 
 def _delivery(row: dict[str, Any]) -> Delivery:
     key = key_of(row.pop("station_id"), row.pop("number"))
-    return Delivery(**{**row, "key": key, "state": DeliveryState(row["state"])})
+    words = {"state": DeliveryState(row["state"]), "outcome": RunState(row["outcome"])}
+    return Delivery(**{**row, "key": key, **words})

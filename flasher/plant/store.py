@@ -1,4 +1,3 @@
-# ruff: noqa: S608  all of this SQL is written here
 """Opens a plant's database with the code of a station's records, for reports and pages."""
 
 from __future__ import annotations
@@ -6,39 +5,36 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final, NoReturn
 from uuid import UUID
 
 from platformdirs import user_cache_path
-from sqlalchemy import Connection, func, select, text
+from sqlalchemy import Connection, func, select
 
 from flasher.errors import UsageError
 from flasher.plant.archive import month_after
 from flasher.plant.central import open_central, plant_location
 from flasher.plant.claim_list import released_runs
-from flasher.plant.schema import SHARED_PARTS, archive_file, shared_part, trace
+from flasher.plant.schema import SHARED_PARTS, archive_file, plant_duplicate, shared_part, trace
 from flasher.station.records.database import Database, Location, locate, open_database
 from flasher.station.records.errors import RecordsDamagedError
 from flasher.station.records.files import FileStore
 from flasher.station.records.heads import ChainHead
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import (
-    DUPLICATES,
-    RELEASED_MARK,
-    PassedRun,
     PassedTwice,
     RunExamination,
     RunFilter,
     RunId,
+    RunRecord,
     StationClock,
-    StepName,
     utc_moment,
 )
-from flasher.station.records.queries import Records
+from flasher.station.records.queries import RUN_QUERY, Records, runs_of
 from flasher.station.records.rows import batches
+from flasher.station.records.schema import run
 from flasher.station.records.store import Store
 
 _USUAL: Final = KeyLocations()
@@ -50,28 +46,6 @@ def cache_folder(url: str) -> Path:
     shown = plant_location(url).shown
     mark = hashlib.sha256(shown.encode()).hexdigest()[:12]
     return user_cache_path("flasher", appauthor=False) / f"plant-{mark}"
-
-
-_ONE: Final = """
-    {of}.id AS {of}_run_id, {of}_station.name AS {of}_station, {of}_socket.name AS {of}_socket,
-    {of}.begun_at AS {of}_begun_at, coalesce(
-        (SELECT '{released}' FROM released_claim c WHERE c.run_id = {of}.id),
-        (SELECT m.text FROM step s JOIN measurement m ON m.step_id = s.id WHERE s.run_id = {of}.id
-            AND s.position = 1 AND s.name = '{step}' AND m.name = '{measured}')) AS {of}_duplicates
-"""
-_OF: Final = """
-    JOIN run {of} ON {of}.id = d.{key} JOIN socket {of}_socket ON {of}_socket.id = {of}.socket_id
-    JOIN station {of}_station ON {of}_station.id = {of}_socket.station_id
-"""
-_NAMES: Final = {
-    "step": StepName.PLANT.value, "measured": DUPLICATES, "released": RELEASED_MARK,
-}  # fmt: skip
-_TWICE: Final = text(
-    f"SELECT unit.serial, unit.part, second.is_virtual, {_ONE.format(of='first', **_NAMES)},"
-    f" {_ONE.format(of='second', **_NAMES)} FROM plant_duplicate d"
-    f" {_OF.format(of='first', key='first_run_id')} {_OF.format(of='second', key='run_id')}"
-    " JOIN unit ON unit.id = second.unit_id ORDER BY d.run_id DESC LIMIT :limit"
-)
 
 
 def shared_parts(
@@ -91,19 +65,13 @@ def shared_parts(
 
 def passed_twice(connection: Connection, limit: int) -> list[PassedTwice]:
     """The newest units that passed at two stations."""
-    rows = connection.execute(_TWICE, {"limit": limit}).mappings()
-    return [
-        PassedTwice(
-            row["serial"],
-            row["part"],
-            row["is_virtual"],
-            *(
-                PassedRun(*(row[f"{of}_{key.name}"] for key in fields(PassedRun)))
-                for of in ("first", "second")
-            ),
-        )
-        for row in rows
-    ]
+    both = (plant_duplicate.c.first_run_id, plant_duplicate.c.run_id)
+    query = select(*both).order_by(plant_duplicate.c.run_id.desc()).limit(limit)
+    pairs = connection.execute(query).all()
+    wanted = {run_id for pair in pairs for run_id in pair}
+    found = runs_of(connection, RUN_QUERY.where(run.c.id.in_(wanted)), released_runs(connection))
+    runs: dict[int, RunRecord] = {each.run_id: each for each in found}
+    return [PassedTwice(runs[first], runs[second]) for first, second in pairs]
 
 
 class PlantFiles(FileStore):

@@ -36,7 +36,7 @@ from flasher.station.events import (
     UnitRemoved,
     WorkerFailed,
 )
-from flasher.station.records.model import Figures, RunState, StepName
+from flasher.station.records.model import Figures, RunRecord, RunState, StepName
 from flasher.station.scans import Word
 from flasher.station.socket import PAGE, source_words
 
@@ -150,7 +150,7 @@ class Board:
     """False if the station was started without a badge table."""
     labels: dict[str, str] = field(default_factory=dict)
     """Labels of the virtual units in sockets, by socket."""
-    ended: dict[str, RunEnded] = field(default_factory=dict)
+    ended: dict[str, RunRecord] = field(default_factory=dict)
     """Last run of each unit, by serial number."""
     refused: list[ScanRefused] = field(default_factory=list)
     waiting: dict[str, str] = field(default_factory=dict)
@@ -339,9 +339,9 @@ class Board:
                 row.note = shown(text)
             case RecordNotSaved(_, _, _, reason):
                 row.note = shown(reason)
-            case RunEnded():
-                self.ended[event.serial] = event
-                row.code = "" if event.outcome is RunState.PASS else event.code
+            case RunEnded(run):
+                self.ended[run.serial] = run
+                row.code = "" if run.state is RunState.PASS else run.code
             case _:
                 pass
 
@@ -362,9 +362,9 @@ class Board:
         return frozenset(name for name, run in self.ended.items() if run.code == changed)
 
     @property
-    def bad_units(self) -> tuple[RunEnded, ...]:
+    def bad_units(self) -> tuple[RunRecord, ...]:
         """Last runs of units that did not pass."""
-        return tuple(each for each in self.ended.values() if each.outcome is not RunState.PASS)
+        return tuple(each for each in self.ended.values() if each.state is not RunState.PASS)
 
 
 def device_event_text(event: LabelFailed | ScannerChanged) -> str:

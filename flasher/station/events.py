@@ -13,12 +13,12 @@ from flasher.station.records.model import (
     Figures,
     RunId,
     RunKind,
-    RunState,
+    RunRecord,
     StepName,
     StepState,
-    Verified,
+    TargetRecord,
 )
-from flasher.validation import LowerCaseInJson
+from flasher.validation import LowerCaseInJson, json_keys
 
 
 class SocketState(LowerCaseInJson, StrEnum):
@@ -263,23 +263,23 @@ class StepEnded(Timed):
         return f"{self.step.value} {self.target}".strip()
 
 
+@json_keys("at socket serial run targets action")
 @dataclass(frozen=True)
 class RunEnded(Timed):
-    """A run has ended **and its outcome is on disk**. `action`: the operator's next action."""
+    """A run has ended **and its outcome is on disk**: run and targets were read from there."""
 
-    socket: str
-    serial: str
-    run_id: RunId
-    kind: RunKind
-    outcome: RunState
-    code: str
-    text: str
+    run: RunRecord
     action: str
-    duration_s: float
-    verified: tuple[tuple[str, Verified], ...] = ()
-    """Verification level of each target, in the recipe's order."""
-    is_virtual: bool = False
-    """True for a virtual unit."""
+    """The operator's next action."""
+    targets: tuple[TargetRecord, ...] = ()
+
+    @property
+    def socket(self) -> str:
+        return self.run.socket
+
+    @property
+    def serial(self) -> str:
+        return self.run.serial
 
 
 @dataclass(frozen=True)

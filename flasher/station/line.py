@@ -425,7 +425,7 @@ class Line:
     def _saved(self, socket: Socket, what: RunEnded, _now: float) -> None:
         socket.phase, socket.note, socket.serial = SocketPhase.REST, "", ""
         if socket.last is not None:
-            socket.last = replace(socket.last, outcome=what.outcome, action=what.action)
+            socket.last = replace(socket.last, outcome=what.run.state, action=what.action)
 
     def _not_saved(self, socket: Socket, what: NotSaved, _now: float) -> None:
         """A part of a run was not saved: the run cannot pass, and no other one starts."""

@@ -5,68 +5,71 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from decimal import Decimal
+from enum import IntEnum
 from functools import cached_property
-from typing import Any, Final
+from typing import Final
 
+from flasher.documents import SCHEMA_VERSION, as_json
 from flasher.protocol.text import no_formula
 from flasher.report.junit import JUnitCase, JUnitResult, JUnitSuite, junit_xml
 from flasher.station.records.capability import Capability
 from flasher.station.records.model import (
     Figures,
-    ReportedRun,
+    PassedTwice,
     RunFilter,
     RunKind,
+    RunRecord,
     RunState,
     utc_text,
 )
-from flasher.station.records.queries import Records
+from flasher.station.records.store import Store
+from flasher.validation import json_keys
 
-SCHEMA_VERSION: Final = 1
+TWICE_MAX: Final = 100
+"""Units that passed at two stations that reports show."""
 
 
+@json_keys("schema filter=chosen figures measurements runs passed_twice")
 @dataclass(frozen=True)
 class Report:
-    """The runs of a filter and their figures, read on first access. Raises RecordError."""
+    """Runs with their figures, read on first access. Raises RecordError."""
 
-    records: Records
+    store: Store
     chosen: RunFilter
+    """What selects the runs."""
+
+    @property
+    def schema(self) -> int:
+        """Version of this schema."""
+        return SCHEMA_VERSION
 
     @cached_property
     def figures(self) -> Figures:
-        return self.records.figures(self.chosen)
+        return self.store.read.figures(self.chosen)
 
     @cached_property
-    def runs(self) -> list[ReportedRun]:
+    def measurements(self) -> list[Capability]:
+        """Measurements with limits."""
+        return self.store.read.capabilities(self.chosen)
+
+    @cached_property
+    def runs(self) -> list[RunRecord]:
         """The runs, oldest first."""
-        return self.records.table(self.chosen)
+        return self.store.read.table(self.chosen)
 
     @cached_property
-    def capabilities(self) -> list[Capability]:
-        return self.records.capabilities(self.chosen)
-
-    def to_dict(self) -> dict[str, Any]:
-        """The report as JSON types; times are UTC texts."""
-        shares = {
-            "yield_share": self.figures.yield_share,
-            "first_pass_share": self.figures.first_pass_share,
-        }
-        return {
-            "schema": SCHEMA_VERSION,
-            "filter": {
-                name: utc_text(value) if isinstance(value, datetime) else value
-                for name, value in asdict(self.chosen).items()
-            },
-            "figures": asdict(self.figures) | shares,
-            "measurements": [asdict(each) for each in self.capabilities],
-            "runs": [vars(run) for run in self.runs],
-        }
+    def passed_twice(self) -> Sequence[PassedTwice]:
+        """Of a plant: the newest 100 units that passed at two stations, without a recipe that asked
+        for it, whatever runs were chosen.
+        """
+        return self.store.passed_twice(TWICE_MAX)
 
     def to_json(self) -> str:
-        return json.dumps(self.to_dict(), indent=1) + "\n"
+        return json.dumps(as_json(self), indent=1) + "\n"
 
     def to_csv(self) -> str:
         """The runs as CSV with a line of headings; "" without runs."""
@@ -74,7 +77,7 @@ class Report:
 
     def to_measurements_csv(self) -> str:
         """The measurements with limits as CSV with a line of headings; "" without any."""
-        rows = [vars(each) for each in self.capabilities]
+        rows = [vars(each) for each in self.measurements]
         return csv_text([*rows[:1], *(map(_exact, row.values()) for row in rows)])
 
     def to_junit(self) -> str:
@@ -105,6 +108,10 @@ def csv_cell(value: object) -> str:
     """Format a cell of CSV; a text that a spreadsheet would take for a formula is escaped."""
     if isinstance(value, str):
         return no_formula(value)
+    if isinstance(value, IntEnum):
+        return value.name.lower()
+    if isinstance(value, datetime):
+        return utc_text(value)
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
@@ -120,7 +127,7 @@ _JUNIT_RESULTS: Final = {
 }
 
 
-def _junit_case(run: ReportedRun) -> JUnitCase:
+def _junit_case(run: RunRecord) -> JUnitCase:
     virtual = "virtual " if run.is_virtual else ""
     return JUnitCase(
         f"{virtual}{run.recipe} {run.recipe_revision}",
@@ -129,5 +136,5 @@ def _junit_case(run: ReportedRun) -> JUnitCase:
         _JUNIT_RESULTS.get(run.state, JUnitResult.PASSED),
         message=run.text,
         type=run.code,
-        timestamp=run.begun_at,
+        timestamp=utc_text(run.begun_at),
     )

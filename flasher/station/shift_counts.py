@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import datetime, time, timedelta
 from typing import Final, NamedTuple
 
-from flasher.station.records.model import RunState
+from flasher.station.records.model import RunRecord, RunState
 
 DEFAULT_SHIFTS: Final = (time(6), time(14), time(22))
 CAUSES_MAX: Final = 3
@@ -33,16 +33,6 @@ class ShiftFigures:
     """Number of the shift's runs without a PASS, by code, most frequent first."""
 
 
-@dataclass(frozen=True)
-class EndedRun:
-    """A run that has ended; `at` has a time zone."""
-
-    at: datetime
-    serial: str
-    outcome: RunState
-    code: str
-
-
 def shift_began(shifts: Iterable[time], now: datetime) -> datetime | None:
     """Start of the current shift. `shifts`: start times in the time zone of `now`."""
     starts = (
@@ -59,12 +49,12 @@ class ShiftCounts:
     """
 
     def __init__(
-        self, shifts: Sequence[time] = DEFAULT_SHIFTS, runs: Iterable[EndedRun] = ()
+        self, shifts: Sequence[time] = DEFAULT_SHIFTS, runs: Iterable[RunRecord] = ()
     ) -> None:
         self._shifts = shifts
         self._runs = list(runs)
 
-    def add(self, run: EndedRun) -> None:
+    def add(self, run: RunRecord) -> None:
         self._runs.append(run)
 
     def began(self, now: datetime) -> datetime:
@@ -75,22 +65,26 @@ class ShiftCounts:
         """Figures at `now`, which has a time zone."""
         began = self.began(now)
         hour = now.replace(minute=0, second=0, microsecond=0)
-        self._runs = runs = [run for run in self._runs if run.at >= min(began, hour)]
-        shift = [run for run in runs if run.at >= began]
-        causes = Counter(run.code for run in shift if run.outcome is not RunState.PASS)
+        self._runs = runs = [run for run in self._runs if _at(run) >= min(began, hour)]
+        shift = [run for run in runs if _at(run) >= began]
+        causes = Counter(run.code for run in shift if run.state is not RunState.PASS)
         first: dict[str, bool] = {}
         for run in shift:
-            if run.outcome in (RunState.PASS, RunState.FAIL):
-                first.setdefault(run.serial, run.outcome is RunState.PASS)
+            if run.state in (RunState.PASS, RunState.FAIL):
+                first.setdefault(run.serial, run.state is RunState.PASS)
         return ShiftFigures(
-            _count(run for run in runs if run.at >= hour),
+            _count(run for run in runs if _at(run) >= hour),
             _count(shift),
             sum(first.values()) / len(first) if first else None,
             tuple(causes.most_common(CAUSES_MAX)),
         )
 
 
-def _count(runs: Iterable[EndedRun]) -> Count:
-    last = {run.serial: run.outcome is RunState.PASS for run in runs}
+def _count(runs: Iterable[RunRecord]) -> Count:
+    last = {run.serial: run.state is RunState.PASS for run in runs}
     good = sum(last.values())
     return Count(good, len(last) - good)
+
+
+def _at(run: RunRecord) -> datetime:
+    return run.ended_at or run.begun_at

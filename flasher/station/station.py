@@ -84,7 +84,7 @@ from flasher.station.records.model import (
     WriteId,
 )
 from flasher.station.records.store import Store, SystemClock
-from flasher.station.runs import ActiveRun, passed_words, save, with_history
+from flasher.station.runs import ActiveRun, save, with_history
 from flasher.station.scans import Refused, Word
 from flasher.station.socket import UNNAMED, Socket, SocketPhase, Source
 from flasher.station.supervisor import Launch, ProcessPort, WorkerLost, WorkerSupervisor
@@ -793,6 +793,7 @@ class Station:
         claim = run.claim
         try:
             result = save(self.store, run, self.clock.monotonic_s)
+            saved = self.store.read.run(claim.run_id)
         except RecordError as error:
             not_saved = self._not_saved(socket, claim.serial, claim.run_id, error)
             self.line.feed(socket, not_saved, self._now)
@@ -801,45 +802,27 @@ class Station:
         self._gate.ended(run.admission)
         code = CODES[result.code]
         is_pass = result.outcome is RunState.PASS
-        text = passed_words(result, claim) if is_pass else result.text
         action = _RECHECK if is_pass and claim.unchecked else code.action
-        ended = RunEnded(
-            socket,
-            claim.serial,
-            claim.run_id,
-            claim.kind,
-            result.outcome,
-            code.name,
-            text,
-            action,
-            max(result.duration_s, run.ended_s - run.begun_s),
-            tuple(result.verified.items()),
-            self.line.sockets[socket].is_virtual,
-        )
+        ended = RunEnded(saved.run, action, saved.targets)
         self.emit(ended)
         self.line.feed(socket, ended, self._now)
         if code is codes.TRACE_NOT_SAVED:  # the next ones would not be judged either
-            self.line.stop(code.name, text, code.action)
+            self.line.stop(code.name, result.text, code.action)
         with suppress(RecordError):
             self.emit(FiguresChanged(self.figures))
         if is_pass:
             self._note_golden(socket, claim)
-            self._print(socket, claim)
+            self._print(saved.run)
         return True
 
     # -- labels (without effect on verdicts) -------------------------------------------------------
 
-    def _print(self, socket: str, claim: Claim) -> None:
+    def _print(self, run: RunRecord) -> None:
         """Print the label of a unit whose PASS is on disk."""
         if self._labels is None or not self._labels.prints_each:
             return
-        try:
-            run = self.store.read.run(claim.run_id).run
-        except RecordError as error:
-            self._label_failed(socket, claim.serial, _error_line(error))
-            return
         if _not_labelled(run) is None and run.kind is not RunKind.VERIFY_ONLY:
-            self._labels.submit(self._label(socket, run))
+            self._labels.submit(self._label(run.socket, run))
 
     def _reprint(self, serial: str, data: Mapping[str, str]) -> Refused | None:
         """Print a label again; returns the refusal, or None."""

@@ -11,7 +11,7 @@ import hashlib
 import time
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any, Final
 
 from starlette.requests import Request
@@ -31,7 +31,8 @@ from flasher.station.events import (
     StationEvent,
 )
 from flasher.station.health import HealthCheck, HealthWatch
-from flasher.station.shift_counts import EndedRun, ShiftCounts, ShiftFigures
+from flasher.station.records.model import RunState
+from flasher.station.shift_counts import ShiftCounts, ShiftFigures
 from flasher.station.socket import PAGE, Source
 from flasher.translation import Translator
 from flasher.web.feed import Feed
@@ -205,10 +206,9 @@ class Screen:
     def show(self, event: StationEvent, board: Board) -> None:
         """Update after the board has applied an event."""
         if isinstance(event, RunEnded):
-            at = datetime.fromisoformat(event.at) if event.at else datetime.now(UTC)
-            self._tally.add(EndedRun(at, event.serial, event.outcome, event.code))
+            self._tally.add(event.run)
             self._passed.pop(event.socket, None)
-            if event.outcome.value == SocketState.PASS.value:
+            if event.run.state is RunState.PASS:
                 self._passed[event.socket] = event
         socket = getattr(event, "socket", "")
         for name in (socket,) if socket in board.rows else tuple(board.rows):

@@ -194,14 +194,14 @@ class SupervisorPages:
     def file_of_runs(self, question: Question) -> Answer:
         media_type, make = _FILES[question.path]
         if make is Report.to_csv:
-            page = self.overview.rows(filter_of(question), _oldest(question), PART_SIZE)
+            page = self.overview.runs(filter_of(question), _oldest(question), PART_SIZE)
             marks = self.released()
             rows = [
-                (row | {"duplicates": marks.get(row["run_id"], row["duplicates"])}).values()
-                for row in page.rows[::-1]
+                replace(run, duplicates=marks.get(run.run_id, run.duplicates))
+                for run in page.rows[::-1]
             ]
-            return _part(question, page, page.rows[0] if page.rows else (), rows)
-        report = Report(self.store.read, filter_of(question))
+            return _part(question, page, rows)
+        report = Report(self.store, filter_of(question))
         name = question.path.lstrip("/")
         return Answer(make(report).encode("utf-8"), media_type, file_name=name)
 
@@ -317,17 +317,9 @@ class SupervisorPages:
         )
 
     def file_of_holders(self, question: Question) -> Answer:
-        heads = ("serial", "part", "target", "confirmed", "run", "outcome", "begun_at")
         sha256 = question.fields.get("sha256", "")
         page = self.overview.holders(sha256, _oldest(question), PART_SIZE)
-        rows = [
-            (
-                each.serial, each.part, each.target, each.is_confirmed, each.run_id,
-                each.state.value, each.begun_at.isoformat(timespec="seconds"),
-            )
-            for each in page.rows[::-1]
-        ]  # fmt: skip
-        return _part(question, page, heads, rows)
+        return _part(question, page, page.rows[::-1])
 
     # -- figures ----------------------------------------------------------------------------------
 
@@ -372,8 +364,8 @@ class SupervisorPages:
                 translate(text("Yield over time")),
                 [_name_of(at).removeprefix(f"{span.end.astimezone():%Y-}") for at, _ in rows],
                 {
-                    "end": [100 * (each.share or 0) for _, each in rows],
-                    "first": [100 * (each.first_share or 0) for _, each in rows],
+                    "end": [100 * (each.yield_share or 0) for _, each in rows],
+                    "first": [100 * (each.first_pass_share or 0) for _, each in rows],
                 },
                 " %",
             )
@@ -456,7 +448,7 @@ class SupervisorPages:
         )
 
     def file_of_measurements(self, question: Question) -> Answer:
-        report = Report(self.store.read, self._figured(question, MEASURED_DAYS)[0])
+        report = Report(self.store, self._figured(question, MEASURED_DAYS)[0])
         made = report.to_measurements_csv()
         return Answer(made.encode("utf-8"), _CSV, file_name="measurements.csv")
 
@@ -604,13 +596,11 @@ def _oldest(question: Question) -> PageCursor:
     return PageCursor(after=cursor_of(question).after or 0)
 
 
-def _part(
-    question: Question, page: Page[Any], heads: Iterable[str], rows: Iterable[Iterable[object]]
-) -> Answer:
+def _part(question: Question, page: Page[Any], rows: Sequence[object]) -> Answer:
     """A part of a spreadsheet file; the first part has the column names."""
     name = {"/images.csv": "units.csv"}.get(question.path, question.path.lstrip("/"))
-    is_first = bool(page.rows) and "after" not in question.fields
-    text = csv_text([*([heads] if is_first else []), *rows])
+    heads = [] if "after" in question.fields else [*map(vars, rows[:1])]
+    text = csv_text([*heads, *(vars(row).values() for row in rows)])
     after = "" if page.newer is None else str(page.newer.after)
     return Answer(text.encode("utf-8"), _CSV, file_name=name, after=after)
 

@@ -15,8 +15,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from flasher.cli.documents import as_json
 from flasher.cli.station.records import certificate
+from flasher.documents import as_json
 from flasher.protocol.spec import BMS
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import (
@@ -118,9 +118,9 @@ def measure(folder: Path, runs: int) -> None:
         timed("figures of all runs", records.figures)
         timed("figures of one lot", lambda: records.figures(RunFilter(lot="L001")))
         timed("all runs", records.table)
-        timed("report of all as CSV", lambda: Report(records, RunFilter()).to_csv())
-        timed("report of all as JSON document", lambda: Report(records, RunFilter()).to_dict())
-        timed("report of all as JUnit", lambda: Report(records, RunFilter()).to_junit())
+        timed("report of all as CSV", lambda: Report(store, RunFilter()).to_csv())
+        timed("report of all as JSON document", lambda: Report(store, RunFilter()).to_json())
+        timed("report of all as JUnit", lambda: Report(store, RunFilter()).to_junit())
         timed("one unit", lambda: as_json(records.unit("W0000017")))
         timed("certificate", lambda: certificate(store, records.unit("W0000017")))
         timed("backup", lambda: store.backup(folder / "backup.sqlite"))

@@ -126,8 +126,8 @@ class Measured:
                 if event.step is StepName.FLASH:
                     self.flash_s.append(event.duration_s)
             case RunEnded():
-                if event.outcome is RunState.PASS:
-                    self.run_s.append(event.duration_s)
+                if event.run.state is RunState.PASS:
+                    self.run_s.append(event.run.duration_s or 0.0)
                     taken_s = now - self._begun_s[event.serial]
                     self.beside_s.append(taken_s - self._steps_s[event.serial])
                 else:

@@ -237,7 +237,7 @@ def measure_report(plant: Plant) -> None:
     plant.cool()
     began = time.perf_counter()
     with plant.open() as store:
-        made = Report(store.read, RunFilter(since=end - timedelta(days=1), until=end))
+        made = Report(store, RunFilter(since=end - timedelta(days=1), until=end))
         text = made.to_csv() + made.to_json() + made.to_junit()
     print(
         f"  report of a day, {len(made.runs)} runs {'':<12} cold"

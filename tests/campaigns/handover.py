@@ -41,7 +41,6 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from pydantic_core import from_json
 
-from flasher.cli.documents import SCHEMA_VERSION
 from flasher.plant.central import Central
 from flasher.plant.courier import Courier
 from flasher.plant.deliveries import Answer, Attempt, Deliveries
@@ -119,7 +118,7 @@ def worker_main(url: str, file: Path, kills: Path, kills_max: int) -> None:
 
     Courier._attempt = dying_attempt  # type: ignore[method-assign]
     parent = os.getppid()
-    with closing(Courier(url, load_receivers(file), SCHEMA_VERSION)) as courier:
+    with closing(Courier(url, load_receivers(file))) as courier:
         courier.deliver(lambda: os.getppid() != parent)
 
 

@@ -24,11 +24,11 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from flasher.cli.documents import as_json
 from flasher.cli.look.explain_text import story_lines
 from flasher.cli.station.scans import read_scans
 from flasher.conformance import diff
 from flasher.conformance import profile as conformance_profile
+from flasher.documents import as_json
 from flasher.errors import FlasherError
 from flasher.image.load import load
 from flasher.report.explain_page import render

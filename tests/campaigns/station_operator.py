@@ -299,8 +299,9 @@ class Operator:
                     )
             case "RunEnded":
                 self.shown.append(event)
-                self.counts[f"shown {event['outcome']} {event['code']}"] += 1
-                if event["outcome"] == "pass":
+                run = event["run"]
+                self.counts[f"shown {run['state']} {run['code']}"] += 1
+                if run["state"] == "pass":
                     self._hold(event["serial"], place)
             case "OperatorPrompted" if place.unit:
                 self.counts["power cycles"] += 1

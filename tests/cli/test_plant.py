@@ -193,7 +193,9 @@ def test_status_and_send(flasher: Flasher, plant: Plant) -> None:
     both = flasher("plant", "status", "--database", url, "--json")
     hold_output(json.loads(SCHEMA.read_text("utf-8")), both.out, both.code)
     assert PASSWORD not in both.out + run.out + sent.out + sent.err
-    assert both.document["checks"]["line-2"][0] == {
+    station = both.document["stations"][0]
+    assert (station["status"]["station"], station["state"]) == ("line-2", "unknown")
+    assert station["checks"][0] == {
         "kind": "refused", "state": "ok", "text": "its records are accepted",
     }  # fmt: skip
     assert re.search(r"^  disk:      [0-9.]+ GiB free$", run.out, re.MULTILINE)

@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from flasher.cli.documents import as_json
 from flasher.cli.plant import handover
+from flasher.documents import as_json
 from flasher.errors import ExitCode
 from flasher.plant.central import Central
 from flasher.plant.deliveries import Deliveries
@@ -104,7 +104,7 @@ def test_what_is_posted_is_the_document_that_the_schema_describes(desk: Desk) ->
         desk.sender.send()
         with central.reading() as connection:
             (row,) = deliveries_of(connection).rows
-        document = as_json(Deliveries(central).document(row.key, 2))
+        document = as_json(Deliveries(central).document(row.key))
     desk.deliver()
     assert desk.receiver.documents == {row.key: document}
 

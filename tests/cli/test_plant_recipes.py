@@ -142,7 +142,7 @@ def test_a_published_recipe_is_fetched_approved_and_used_from_the_next_unit_on(
             people.see("UnitArrived")
             serials.append(people.label)
             yield serials[-1]
-            people.see("RunEnded", outcome="pass")
+            people.see("RunEnded", action="Take the unit out.")
 
     people = People(scans)
     with monkeypatch.context() as patch:

@@ -156,7 +156,7 @@ def test_virtual_units_are_scanned_and_flashed_until_the_wanted_number(
     assert run.code == ExitCode.OK, "not a terminal: JSON lines without --json"
     lines = hold_output(schema, run.out, 0)
     _, document = lines_of(run)
-    assert [unit["outcome"] for unit in document["units"]] == ["pass"] * 3
+    assert [unit["state"] for unit in document["units"]] == ["pass"] * 3
     assert document["figures"]["first_pass_share"] == 1.0
     assert document["is_complete"]
     assert document["records"] == "", "recorded nowhere"
@@ -174,7 +174,7 @@ def test_virtual_units_that_are_exchanged_in_their_runs_pass_in_the_end(
     words = ("--mock-sockets", "1", "--units", "2", "--mock-bad", "0", "--mock-exchanged", "1")
     run = flasher("station", "run", "--recipe", recipe, *words, *FAST)
     lines, document = lines_of(run)
-    ended = [(e["serial"], e["code"]) for e in lines if e["event"] == "RunEnded"]
+    ended = [(e["serial"], e["run"]["code"]) for e in lines if e["event"] == "RunEnded"]
     first, second = (unit["serial"] for unit in document["units"])
     assert ended == [(first, "UNIT_CHANGED"), (second, "OK"), (first, "OK")]
     assert run.code == ExitCode.OK
@@ -209,7 +209,7 @@ def test_a_golden_unit_is_checked_and_releases_the_line(
         monkeypatch.setattr(sys, "stdin", io.StringIO("BADGE-1\n"))
     run = flasher(*words, "W2605000", "--json")
     assert run.code == ExitCode.OK, run.err
-    assert [unit["outcome"] for unit in lines_of(run)[1]["units"]] == ["pass"]
+    assert [unit["state"] for unit in lines_of(run)[1]["units"]] == ["pass"]
     with Store.open(str(tmp_path / "records.sqlite"), station="reader", create=False) as store:
         (row,) = store.read.noted("line-2", AuditEvent.RELEASED)
         (details,) = store.read.unit("W2605000").runs
@@ -230,9 +230,9 @@ def test_a_file_of_scans_ends_the_station_and_a_bad_unit_is_exit_code_12(
     document = lines_of(run)[1]
     assert {unit["serial"] for unit in document["units"]} == {"W2605002", "W2605003"}
     for unit in document["units"]:
-        assert unit["outcome"] == "fail"
+        assert unit["state"] == "fail"
         assert unit["code"] in ("WRONG_HARDWARE", "REFUSED")
-        assert unit["action"].startswith("Put the unit aside")
+        assert "Put the unit aside" in unit["text"]
     assert [each["text"] for each in document["refused"]] == ["NO LABEL"]
     with Store.open(str(database), station="reader", create=False) as store:
         (details,) = store.read.unit("W2605002").runs
@@ -639,7 +639,7 @@ def test_ctrl_c_finishes_what_runs_and_begins_no_further_unit(
     run = flasher("station", "run", "--recipe", recipe, *words)
     assert run.code == ExitCode.INTERRUPTED
     document = lines_of(run)[1]
-    assert [unit["outcome"] for unit in document["units"]] == ["pass"]
+    assert [unit["state"] for unit in document["units"]] == ["pass"]
     assert not document["is_complete"]
     assert "Ctrl-C again" in run.err
 
@@ -654,7 +654,7 @@ def test_a_second_ctrl_c_stops_the_runs_which_are_recorded_as_aborted(
     run = flasher("station", "run", "--recipe", recipe, *slow, "--database", database)
     assert run.code == ExitCode.INTERRUPTED
     (unit,) = lines_of(run)[1]["units"]
-    assert (unit["outcome"], unit["code"]) == ("aborted", "OPERATOR_ABORT")
+    assert (unit["state"], unit["code"]) == ("aborted", "OPERATOR_ABORT")
     with Store.open(str(database), station="reader", create=False) as store:
         assert [each.state for each in store.read.table()] == [RunState.ABORTED]
 

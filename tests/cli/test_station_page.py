@@ -24,10 +24,10 @@ from flasher.cli.station import pages
 from flasher.cli.station.pages import OperatorView
 from flasher.errors import ExitCode, UsageError
 from flasher.station.board import Board
-from flasher.station.events import RunEnded, StationEvent
+from flasher.station.events import StationEvent
 from flasher.station.records.errors import DiskFullError
 from flasher.station.records.keys import KeyLocations
-from flasher.station.records.model import RunId, RunKind, RunState
+from flasher.station.records.model import RunKind, RunState
 from flasher.station.records.store import Store
 from flasher.web.guard import TOKEN_HEADER
 from flasher.web.operator import CurrentLot, Screen
@@ -37,6 +37,7 @@ from tests.cli.station_threads import ThreadPort
 from tests.loops import each
 from tests.station.factory import USUAL, Bench, make_recipe
 from tests.station.line_bench import LineBench
+from tests.station.line_inputs import saved
 
 pytestmark = pytest.mark.slow
 
@@ -308,8 +309,7 @@ def test_the_lot_counts_as_the_recipes_of_all_sockets_do(tmp_path: Path) -> None
     view.turn()
     ends = [("W2605002", RunKind.PRODUCTION), ("W2605003", RunKind.GOLDEN)]
     for serial, kind in ends:
-        ended = RunEnded("A", serial, RunId(1), kind, RunState.PASS, "OK", "", "", 1.0)
-        view.show(ended)
+        view.show(saved("A", RunState.PASS, serial=serial, kind=kind))
     view.turn()
     assert seen.lots == [CurrentLot("L17", 10, 0), CurrentLot("L17", 10, 1)]
 

@@ -21,6 +21,7 @@ from flasher.cli.station.documents import LINES
 from flasher.cli.station.run import _Session
 from flasher.cli.station.scans import LineReader, ScanFile, Typing
 from flasher.cli.station.views import Table, draw
+from flasher.documents import SCHEMA_VERSION
 from flasher.errors import UsageError
 from flasher.station.board import Board
 from flasher.station.events import (
@@ -29,7 +30,6 @@ from flasher.station.events import (
     OperatorPrompted,
     Progressed,
     RecipeChanged,
-    RunEnded,
     RunStarted,
     ScanAccepted,
     ScanRefused,
@@ -41,7 +41,7 @@ from flasher.station.events import (
     UnitArrived,
     WorkerFailed,
 )
-from flasher.station.records.model import Figures, RunId, RunKind, RunState, StepName
+from flasher.station.records.model import Figures, RunId, RunKind, RunRecord, RunState, StepName
 from flasher.station.socket import Occupancy, Socket
 from tests.cli.conftest import Flasher
 from tests.cli.station_threads import ThreadPort
@@ -51,16 +51,16 @@ from tests.cli.test_station import FAST, WRITE
 from tests.loops import each
 from tests.schema_document import SCHEMA
 from tests.station.factory import USUAL, write_recipe
+from tests.station.line_inputs import RECORD, saved
 
-FIGURES = Figures(3, 3, 2, 1, {"PASS": 2, "FAIL": 1}, {"REFUSED": 1}, 4.8, 5.5)
+FIGURES = Figures(3, 2, 1, 3, {RunState.PASS: 2, RunState.FAIL: 1}, {"REFUSED": 1}, 4.8, 5.5)
 
 
 def ended(
     outcome: RunState = RunState.FAIL, code: str = "REFUSED", serial: str = "W2"
 ) -> Iterator[StationEvent]:
-    yield RunEnded(
-        "1", serial, RunId(1), RunKind.PRODUCTION, outcome, code, "No.", "Put it aside.", 1.0
-    )
+    text = "No. Put it aside."
+    yield saved("1", outcome, "Put it aside.", code=code, serial=serial, text=text)
     yield SocketChanged("1", SocketState(outcome.value), serial, "Put it aside.")
 
 
@@ -393,6 +393,8 @@ def sample(hint: Any) -> Any:
     hint = getattr(hint, "__supertype__", hint)
     if hint is Figures:
         return FIGURES
+    if hint is RunRecord:
+        return RECORD
     if hint is bool:
         return True
     options = get_args(hint)
@@ -407,7 +409,7 @@ def sample(hint: Any) -> Any:
 def test_every_event_is_as_described(event: Any) -> None:
     schema = json.loads(SCHEMA.read_text(encoding="utf-8"))
     made = event(**{name: sample(hint) for name, hint in get_type_hints(event).items()})
-    line = {"schema": 2, **to_json(made)}
+    line = {"schema": SCHEMA_VERSION, **to_json(made)}
     hold(schema, f"line.{event.__name__}", json.loads(json.dumps(line)))
 
 

@@ -320,7 +320,7 @@ def test_sigterm_to_all_processes_of_a_station_finishes_the_runs_that_go_on(tmp_
     assert process.returncode == ExitCode.INTERRUPTED
     units = json.loads(out.splitlines()[-1])["units"]
     assert units
-    assert {unit["outcome"] for unit in units} == {"pass"}
+    assert {unit["state"] for unit in units} == {"pass"}
     assert "Ctrl-C again" in err
 
 

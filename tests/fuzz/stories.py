@@ -9,8 +9,8 @@ from pathlib import Path
 from random import Random
 from typing import Final
 
-from flasher.cli.documents import as_json
 from flasher.cli.look.explain_text import story_lines
+from flasher.documents import as_json
 from flasher.errors import UsageError
 from flasher.protocol.frame import Frame
 from flasher.report.explain_page import render

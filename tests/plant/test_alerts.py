@@ -8,7 +8,8 @@ from datetime import UTC, datetime, time, timedelta
 
 import pytest
 
-from flasher.plant.activity import Activity, RecentRun, SocketRuns, Yield, activities
+from flasher.documents import as_json
+from flasher.plant.activity import Activity, RecentRun, SocketRuns, activities
 from flasher.plant.alerts import (
     Bounds,
     CheckKind,
@@ -19,7 +20,7 @@ from flasher.plant.alerts import (
 )
 from flasher.plant.central import Central
 from flasher.plant.stations import StationStatus
-from flasher.station.records.model import RunState, utc_text
+from flasher.station.records.model import RunState, Units, utc_text
 from tests.plant.factory import READER, Plant, Sender
 
 NOW = datetime(2026, 5, 17, 12, 0, tzinfo=UTC)
@@ -50,7 +51,7 @@ def runs(*codes: str, age_s: float = 60.0) -> SocketRuns:
     )
 
 
-BUSY = Activity(Yield(20, 20), Yield(40, 40), (runs("OK", "OK", "OK"),))
+BUSY = Activity(Units(20, 20), Units(40, 40), (runs("OK", "OK", "OK"),))
 
 
 def state_of(
@@ -123,7 +124,7 @@ def test_a_station_that_never_connected_is_not_known() -> None:
     [(0, 0, UNKNOWN), (19, 0, UNKNOWN), (20, 18, OK), (20, 17, ALERT)],
 )
 def test_yield_needs_enough_units(units: int, passed: int, state: CheckState) -> None:
-    activity = replace(BUSY, shift=Yield(units, passed))
+    activity = replace(BUSY, shift=Units(units, passed))
     assert state_of(CheckKind.YIELD, activity=activity) is state
 
 
@@ -160,8 +161,9 @@ def test_yield_and_last_runs_are_those_of_each_station(plant: Plant, sender: Sen
         found = activities(connection, [time(10)], NOW, 2)
         night = activities(connection, [time(8)], NOW + timedelta(hours=13), 1)["line-3"]
         (two, three) = overviews(connection, BOUNDS, [time(6)], NOW)
-    assert (found["line-2"].shift, found["line-2"].day) == (Yield(2, 1), Yield(3, 1))
-    assert (found["line-3"].shift, found["line-3"].day) == (Yield(), Yield(1, 1))
+    assert (found["line-2"].shift, found["line-2"].day) == (Units(2, 1), Units(3, 1))
+    assert (found["line-3"].shift, found["line-3"].day) == (Units(), Units(1, 1, 1))
+    assert as_json(found["line-3"])["day"]["passed"] == 1
     assert [len(each.runs) for each in found["line-2"].sockets] == [2, 1]
     last = found["line-2"].last_run
     assert last is not None

@@ -519,8 +519,7 @@ def test_a_run_that_arrives_after_its_claim_was_released_is_marked(
     with closing(Central(plant.url(READER))) as central, central.reading() as connection:
         (old,) = releases_of(connection, ClaimFilter())
         documents = [
-            document_of(connection, station, number, 2).run.run
-            for station, number in plant.rows(ENDS)
+            document_of(connection, station, number).run.run for station, number in plant.rows(ENDS)
         ]
         assert claims_of(connection, ClaimFilter()) == []
     marks = {each.station: each.duplicates for each in documents}

@@ -43,7 +43,7 @@ class Desk:
         deliveries = Deliveries(self.central)
         with self.central.reading() as connection:
             (row,) = deliveries_of(connection, DeliveryFilter("mes", serial=serial)).rows
-        attempt = deliveries.begin("mes", *parse_key(row.key), 2)
+        attempt = deliveries.begin("mes", *parse_key(row.key))
         assert attempt is not None
         deliveries.end(attempt, Answer(state, answer))
         return row.key

@@ -16,6 +16,7 @@ from typing import Any
 import psycopg
 import pytest
 
+from flasher.documents import SCHEMA_VERSION, as_json
 from flasher.errors import UsageError
 from flasher.plant import courier
 from flasher.plant.central import Central
@@ -47,7 +48,7 @@ class Desk:
     def deliver(self, **settings: Any) -> None:
         """What is due, by a new worker."""
         receivers = [self.settings(**settings)]
-        with closing(Courier(self.plant.url(COURIER), receivers, 2, self._keep)) as worker:
+        with closing(Courier(self.plant.url(COURIER), receivers, self._keep)) as worker:
             worker.deliver(lambda: False, once=True)
 
     def _keep(self, _attempt: Attempt, answer: Answer) -> None:
@@ -101,13 +102,12 @@ def test_a_run_arrives_at_the_receiver_with_its_key_and_all_its_parts(desk: Desk
     key = f"{station}-{number}"
     assert list(desk.receiver.documents) == [key]
     document = desk.receiver.documents[key]
-    assert (document["schema"], document["row"]) == (2, number)
+    assert (document["schema"], document["row"]) == (SCHEMA_VERSION, number)
     with closing(desk.plant.store()) as store:
         (run,) = store.read.table()
-        details = store.read.run(run.run_id)  # type: ignore[arg-type]
-    assert document["run"]["run"]["serial"] == details.run.serial
-    assert len(document["run"]["steps"]) == len(details.steps) > 0
-    assert document["run"]["attachments"][0]["sha256"] == details.attachments[0].sha256
+        details = store.read.run(run.run_id)
+    assert document["run"] == as_json(details), "as flasher station unit --json prints it"
+    assert document["run"]["run"]["verified"] == "version"
     found = desk.only()
     assert (found.key, found.state, found.attempts) == (key, DeliveryState.CONFIRMED, 1)
     assert desk.plant.rows("SELECT count(*) FROM procrastinate_jobs") == [(0,)]
@@ -190,7 +190,7 @@ def test_an_outage_is_one_line_and_its_end_is_another(
     desk.receiver.plan = lambda: next(acts, Act.REFUSE)
     begun = threading.Event()
     worker = Courier(
-        desk.plant.url(COURIER), [desk.settings()], 2, desk._keep, lines.append, begun.set
+        desk.plant.url(COURIER), [desk.settings()], desk._keep, lines.append, begun.set
     )
     with closing(worker):
         worker.deliver(lambda: desk.only().state is DeliveryState.REFUSED)
@@ -214,7 +214,7 @@ def test_a_database_that_is_away_is_one_line(desk: Desk, monkeypatch: pytest.Mon
         return sweep(of)
 
     monkeypatch.setattr(Deliveries, "sweep", broken)
-    worker = Courier(desk.plant.url(COURIER), [desk.settings()], 2, say=lines.append)
+    worker = Courier(desk.plant.url(COURIER), [desk.settings()], say=lines.append)
     with closing(worker):
         worker.deliver(lambda: len(lines) > 1)
     first, second = lines
@@ -226,7 +226,7 @@ def test_a_worker_that_died_before_it_recorded_the_answer(desk: Desk) -> None:
     desk.sender.bench.make()
     desk.sender.send()
     desk.fetch()
-    attempt = desk.deliveries.begin("mes", *parse_key(desk.only().key), 2)
+    attempt = desk.deliveries.begin("mes", *parse_key(desk.only().key))
     assert attempt is not None
 
     async def send() -> Answer:
@@ -304,8 +304,8 @@ def test_a_late_answer_does_not_replace_a_confirmation(desk: Desk) -> None:
     desk.sender.bench.make()
     desk.sender.send()
     station, number = parse_key(desk.only().key)
-    first = desk.deliveries.begin("mes", station, number, 2)
-    second = desk.deliveries.begin("mes", station, number, 2)
+    first = desk.deliveries.begin("mes", station, number)
+    second = desk.deliveries.begin("mes", station, number)
     assert first is not None
     assert second is not None
     desk.deliveries.end(first, Answer(DeliveryState.UNKNOWN, "late"))
@@ -313,7 +313,7 @@ def test_a_late_answer_does_not_replace_a_confirmation(desk: Desk) -> None:
     desk.deliveries.end(first, Answer(DeliveryState.CONFIRMED, "HTTP 200"))
     desk.deliveries.end(second, Answer(DeliveryState.UNKNOWN, "no answer"))
     assert desk.only().state is DeliveryState.CONFIRMED
-    assert desk.deliveries.begin("mes", station, number, 2) is None
+    assert desk.deliveries.begin("mes", station, number) is None
 
 
 def test_two_receivers_do_not_wait_for_each_other(desk: Desk) -> None:
@@ -331,9 +331,9 @@ def test_two_receivers_do_not_wait_for_each_other(desk: Desk) -> None:
 def test_keys_that_are_none(desk: Desk) -> None:
     for key in ("", "1204", "x-1", "0a6c3e42-7d1f-4b58-9c3a-5d2e8f901b47"):
         with pytest.raises(UsageError, match="not the key of a run"):
-            desk.deliveries.document(key, 2)
+            desk.deliveries.document(key)
     with pytest.raises(NotFoundError):
-        desk.deliveries.document("0a6c3e42-7d1f-4b58-9c3a-5d2e8f901b47-7", 2)
+        desk.deliveries.document("0a6c3e42-7d1f-4b58-9c3a-5d2e8f901b47-7")
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,8 @@ from flasher.plant.retire import Retirement
 from flasher.plant.store import PlantRecords, PlantStore
 from flasher.station.records import rollup
 from flasher.station.records.capability import Capability
-from flasher.station.records.model import Admission, Order, RunFilter, RunState
-from flasher.station.records.rollup import Rollup, Units
+from flasher.station.records.model import Admission, Order, RunFilter, RunState, Units
+from flasher.station.records.rollup import Rollup
 from flasher.web.query_processes import Question
 from flasher.web.supervisor import SupervisorPages
 from tests.plant.factory import READER, Plant, Sender

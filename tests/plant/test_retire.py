@@ -149,7 +149,7 @@ def test_a_month_that_is_not_handed_over_stays(plant: Plant, sender: Sender) -> 
         assert not (plant.folder / "archive").exists()
         with central.reading() as connection:
             (oldest,) = deliveries_of(connection, DeliveryFilter("mes", serial="W2605002")).rows
-        attempt = deliveries.begin("mes", *parse_key(oldest.key), 1)
+        attempt = deliveries.begin("mes", *parse_key(oldest.key))
         assert attempt is not None
         deliveries.end(attempt, Answer(DeliveryState.CONFIRMED, "200"))
         assert [each.month for each in retired(plant, "2026-06")] == ["2026-05"]

@@ -167,6 +167,15 @@ class Bench:
             connection.execute("PRAGMA synchronous = OFF")
             yield connection
 
+    def forge(self, statement: str) -> None:
+        """Change what a station protects, as somebody who takes the rules away."""
+        with self.outsider() as connection:
+            rules = connection.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'")
+            for (name,) in rules.fetchall():
+                connection.execute(f"DROP TRIGGER {name}")
+            connection.execute(statement)
+            connection.commit()
+
     @property
     def keys(self) -> Path:
         """Where the station's key is, and the heads beside it."""

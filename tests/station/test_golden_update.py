@@ -45,7 +45,7 @@ def test_a_golden_unit_releases_this_flasher_with_this_recipe(bench: Bench) -> N
     assert (refused.code, GOLDEN in refused.remedy) == ("GOLDEN_DUE", True)
     assert begun(line) == []
     line.run(GOLDEN)
-    assert line.last(RunEnded).outcome is RunState.PASS
+    assert line.last(RunEnded).run.state is RunState.PASS
     (row,) = bench.store.read.noted("line-2", AuditEvent.RELEASED)
     assert (row["recipe_sha256"], row["serial"]) == (bench.recipe.sha256, GOLDEN)
     line.run(SERIAL)

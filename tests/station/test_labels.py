@@ -115,7 +115,7 @@ def test_no_label_before_the_pass_is_on_disk(bench: Bench, monkeypatch: pytest.M
     assert printer.came.empty()
     monkeypatch.setattr(Store, "finish", real)
     line.scan("RESUME")
-    assert line.last(RunEnded).outcome is RunState.PASS
+    assert line.last(RunEnded).run.state is RunState.PASS
     assert SERIAL.encode() in printer.came.get(timeout=LIMIT_S)
     finished(line)
 
@@ -145,7 +145,7 @@ def test_a_printer_that_hangs_delays_nothing(bench: Bench) -> None:
     line = LineBench(bench, labels=printer.labels)
     line.make("A", SERIAL)
     line.make("B", OTHER)
-    assert [event.outcome for event in line.of(RunEnded)] == [RunState.PASS] * 2
+    assert [event.run.state for event in line.of(RunEnded)] == [RunState.PASS] * 2
     assert line.state("B") is SocketState.PASS
     assert line.of(LabelPrinted) == []
     goes_on.set()
@@ -189,7 +189,7 @@ def test_a_printer_that_fails_touches_no_verdict_and_is_said(bench: Bench) -> No
     assert (failed.socket, failed.serial) == ("A", SERIAL)
     assert failed.reason == "The printer is out of paper."
     assert failed.remedy == f"Repair the printer, then scan REPRINT {SERIAL}."
-    assert bench.store.read.run(line.last(RunEnded).run_id).run.state is RunState.PASS
+    assert bench.store.read.run(line.last(RunEnded).run.run_id).run.state is RunState.PASS
     board = Board()
     for event in line.events:
         board.apply(event)

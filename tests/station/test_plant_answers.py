@@ -69,7 +69,7 @@ def test_the_run_begins_with_the_answer_which_is_recorded(plant: Plant) -> None:
     line.end("A")
     ended = line.last(RunEnded)
     assert ended.action == "Take the unit out."
-    details = line.bench.store.read.run(ended.run_id)
+    details = line.bench.store.read.run(ended.run.run_id)
     step = details.steps[0]
     assert (step.name, step.state, details.run.duplicates) == ("plant", StepState.PASS, "checked")
     names = [each.name for each in step.measurements]
@@ -87,11 +87,11 @@ def test_without_an_answer_the_pass_is_marked_everywhere(plant: Plant) -> None:
     plant.line.work("A")
     plant.line.end("A")
     ended = plant.line.last(RunEnded)
-    assert ended.text == "bms: version read back; duplicates not checked"
+    assert ended.run.text == "bms: version read back; duplicates not checked"
     assert ended.action.startswith("Put it aside")
     assert plant.line.text("A") == ended.action
-    details = plant.line.bench.store.read.run(ended.run_id)
-    assert (details.run.state, details.run.text) == (RunState.PASS, ended.text)
+    details = plant.line.bench.store.read.run(ended.run.run_id)
+    assert (details.run.state, details.run.text) == (RunState.PASS, ended.run.text)
     assert details.run.duplicates == "not checked: no answer within 3 s"
     assert details.steps[0].state is StepState.SKIPPED
     assert plant.line.bench.store.examine().problems == ()
@@ -102,7 +102,7 @@ def test_a_run_whose_claim_the_plant_released_is_marked_in_the_records(plant: Pl
     plant.answer()
     plant.line.work("A")
     plant.line.end("A")
-    store, run_id = plant.line.bench.store, plant.line.last(RunEnded).run_id
+    store, run_id = plant.line.bench.store, plant.line.last(RunEnded).run.run_id
     life = store.read.unit(SERIAL)
     before = certificate(store, life)
     assert not check_certificate(store, before).problems

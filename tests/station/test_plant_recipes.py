@@ -226,7 +226,7 @@ def test_a_run_finishes_with_the_recipe_that_it_began_with(plant: Plant) -> None
     plant.restart("B")  # this one was idle
     line.work("A")
     line.end("A")
-    assert line.last(RunEnded).outcome is RunState.PASS
+    assert line.last(RunEnded).run.state is RunState.PASS
     plant.restart("A")
     assert plant.revision(SERIAL) == "4"
     plant.make("A", OTHER)

@@ -70,11 +70,11 @@ def test_a_unit_is_scanned_connected_run_and_shown(line: LineBench) -> None:
     line.work("A")
     line.end("A")
     ended = line.last(RunEnded)
-    assert (ended.outcome, ended.code, ended.action) == (RunState.PASS, "OK", "Take the unit out.")
-    assert ended.verified == (("bms", Verified.VERSION),)
+    assert (ended.run.state, ended.run.code) == (RunState.PASS, "OK")
+    assert ended.action == "Take the unit out."
     assert line.state("A") is SocketState.PASS
-    run = line.bench.store.read.run(ended.run_id)
-    assert run.run.state is RunState.PASS
+    run = line.bench.store.read.run(ended.run.run_id)
+    assert (run.run, run.targets) == (ended.run, ended.targets)
     assert [step.name for step in run.steps] == ["flash bms", "save"]
     assert line.bench.store.examine().problems == ()
 
@@ -549,7 +549,7 @@ def test_an_outcome_that_cannot_be_saved_is_never_green(line: LineBench, bench: 
     assert line.last(ScanRefused).code == "STILL_NOT_SAVED"
     other.execute("ROLLBACK")
     line.scan("RESUME")
-    assert line.last(RunEnded).outcome is RunState.PASS
+    assert line.last(RunEnded).run.state is RunState.PASS
     assert line.state("A") is SocketState.PASS
     assert line.of(LineResumed)
     other.close()
@@ -581,7 +581,7 @@ def test_a_run_of_which_a_part_is_not_saved_cannot_pass(
     # Even a process that would claim a PASS does not get one.
     line.end("A")
     ended = line.last(RunEnded)
-    assert (ended.outcome, ended.code) == (RunState.ERROR, "RECORD_NOT_SAVED")
+    assert (ended.run.state, ended.run.code) == (RunState.ERROR, "RECORD_NOT_SAVED")
     assert line.state("A") is SocketState.RECHECK
     assert line.station.line.stopped is not None
 
@@ -604,12 +604,12 @@ def test_a_full_disk_under_a_run_is_never_green(line: LineBench, bench: Bench) -
             break
     line.end("A")
     assert SocketState.PASS not in {view.state for view in line.station.line.sockets.values()}
-    assert all(ended.outcome is not RunState.PASS for ended in line.of(RunEnded))
+    assert all(ended.run.state is not RunState.PASS for ended in line.of(RunEnded))
     assert "disk is full" in line.last(LineStopped).reason
     event.remove(engine, "connect", no_room)
     bench.store.database.close()
     line.scan("RESUME")
-    assert line.last(RunEnded).code == "RECORD_NOT_SAVED"
+    assert line.last(RunEnded).run.code == "RECORD_NOT_SAVED"
     assert bench.store.read.unit(SERIAL).state is UnitState.RECHECK
 
 
@@ -662,7 +662,7 @@ def test_a_claim_that_was_saved_although_it_seemed_lost_keeps_no_unit_from_being
     assert line.order("A").kind is RunKind.RECHECK
     line.work("A")
     line.end("A")
-    assert line.last(RunEnded).outcome is RunState.PASS
+    assert line.last(RunEnded).run.state is RunState.PASS
 
 
 def test_a_trace_that_is_not_what_was_written_is_no_pass(line: LineBench) -> None:
@@ -671,7 +671,7 @@ def test_a_trace_that_is_not_what_was_written_is_no_pass(line: LineBench) -> Non
     line.work("A")
     line.trace("A")
     line.say("A", RunResult(RunState.PASS, "OK", "", 1.0, {"bms": Verified.VERSION}, "0" * 64))
-    assert line.last(RunEnded).code == "TRACE_NOT_SAVED"
+    assert line.last(RunEnded).run.code == "TRACE_NOT_SAVED"
 
 
 def test_a_pass_that_the_records_know_better_is_none(line: LineBench) -> None:
@@ -680,7 +680,7 @@ def test_a_pass_that_the_records_know_better_is_none(line: LineBench) -> None:
     line.ask("A", JournalWrite("bms", "flash", "V1"))  # never verified
     line.end("A")
     ended = line.last(RunEnded)
-    assert (ended.outcome, ended.code) == (RunState.ERROR, "INTERNAL")
+    assert (ended.run.state, ended.run.code) == (RunState.ERROR, "INTERNAL")
     assert line.state("A") is SocketState.RECHECK
 
 
@@ -694,7 +694,7 @@ def test_a_process_that_dies_costs_its_own_run_and_no_other(line: LineBench) -> 
     line.arrive("B")
     line.ports["A"].is_gone = True
     line.turn()
-    assert line.last(RunEnded).code == "PROCESS_DIED"
+    assert line.last(RunEnded).run.code == "PROCESS_DIED"
     assert line.bench.store.read.unit(SERIAL).state is UnitState.RECHECK
     assert line.state("B") is SocketState.RUNNING
     line.work("B")
@@ -711,7 +711,7 @@ def test_a_process_that_hangs_is_ended_and_started_again(line: LineBench) -> Non
     line.bench.clock.go_on(2.0)
     line.turn()
     assert hanging.killed == 1
-    assert line.last(RunEnded).code == "PROCESS_HUNG"
+    assert line.last(RunEnded).run.code == "PROCESS_HUNG"
     assert line.last(WorkerFailed).restart_in_s == 1.0
     line.bench.clock.go_on(1.5)
     line.turn()
@@ -831,7 +831,7 @@ def test_a_station_that_ends_stops_its_runs_and_saves_them(line: LineBench) -> N
     assert any(message == Stop() for message in line.ports["A"].heard)
     line.end("A", RunState.ABORTED, "OPERATOR_ABORT")
     line.station.close()
-    assert line.last(RunEnded).outcome is RunState.ABORTED
+    assert line.last(RunEnded).run.state is RunState.ABORTED
 
 
 def test_labels_of_virtual_units_may_scan_themselves(bench: Bench) -> None:
@@ -946,5 +946,5 @@ def test_a_pass_of_a_first_run_that_flashed_nothing_is_none(line: LineBench) -> 
     line.ask("A", tried(StepName.VERIFY), read)
     line.end("A")
     ended = line.last(RunEnded)
-    assert (ended.outcome, ended.code) == (RunState.ERROR, "INTERNAL")
-    assert "every target flashed" in ended.text or "forbids" in ended.text
+    assert (ended.run.state, ended.run.code) == (RunState.ERROR, "INTERNAL")
+    assert "every target flashed" in ended.run.text or "forbids" in ended.run.text

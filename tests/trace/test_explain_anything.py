@@ -7,8 +7,8 @@ import random
 
 import pytest
 
-from flasher.cli.documents import as_json
 from flasher.cli.look.explain_text import story_lines
+from flasher.documents import as_json
 from flasher.protocol.bittime import message_bits
 from flasher.protocol.frame import Frame
 from flasher.trace.decoder import TimedDecoder, TimedEvent, bits_of

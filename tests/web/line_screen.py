@@ -19,13 +19,14 @@ from flasher.station.events import (
     StationStarted,
 )
 from flasher.station.health import HealthWatch
-from flasher.station.records.model import RunId, RunKind, RunState
+from flasher.station.records.model import RunState
 from flasher.station.shift_counts import ShiftCounts
 from flasher.station.socket import Source
 from flasher.web.guard import application
 from flasher.web.operator import CurrentLot, OperatorPage, Screen
 from flasher.web.pages import Pages
 from flasher.web.server import Server
+from tests.station.line_inputs import saved
 
 _KEY = "of the test"
 AT = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
@@ -94,10 +95,11 @@ class LineScreen:
 
 
 def ended(socket: str, serial: str, outcome: RunState, code: str = "REFUSED") -> RunEnded:
-    return RunEnded(
-        socket, serial, RunId(1), RunKind.PRODUCTION, outcome,
-        "OK" if outcome is RunState.PASS else code, "", "Take the unit out.", 5.0, at=AT,
-    )  # fmt: skip
+    code = "OK" if outcome is RunState.PASS else code
+    at = datetime.fromisoformat(AT)
+    return saved(
+        socket, outcome, "Take the unit out.", serial=serial, code=code, begun_at=at, ended_at=at
+    )
 
 
 @contextmanager

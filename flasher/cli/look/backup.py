@@ -19,7 +19,6 @@ from platformdirs import user_data_path
 from flasher import __version__
 from flasher.api import as_target
 from flasher.cli import values
-from flasher.cli.documents import as_json
 from flasher.cli.files import check_new, claimed, write_whole
 from flasher.cli.framework import argument, group, missing_option, option
 from flasher.cli.look.info import InfoDocument, info_document, silence_error
@@ -28,6 +27,7 @@ from flasher.cli.options import Bus, bus_options, profile_option, target_option
 from flasher.cli.output import Output, byte_count
 from flasher.cli.recording import RecordingOptions, recorded_device, recording_options
 from flasher.cli.terminal import agrees, check_can_ask
+from flasher.documents import as_json
 from flasher.errors import ErrorCode, ExitCode, UsageError, VerificationError
 from flasher.files import parse_json, read
 from flasher.host.query import READ_MEMORY

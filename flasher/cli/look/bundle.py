@@ -12,12 +12,12 @@ from typing import Final
 
 from flasher.cli import values
 from flasher.cli.adapters import detect_adapters, slcan_ports
-from flasher.cli.documents import as_json
 from flasher.cli.files import check_new, check_not_read, write_whole
 from flasher.cli.framework import argument, command, option
 from flasher.cli.look.adapters import adapters_document
 from flasher.cli.look.explain import find_source
 from flasher.cli.output import Output, byte_count
+from flasher.documents import as_json
 from flasher.errors import ExitCode, UsageError
 from flasher.files import read
 from flasher.history import FlashHistory

@@ -18,9 +18,8 @@ from flasher.cli.plant.documents import (
     PlantSendDocument,
     PlantStatusDocument,
 )
-from flasher.cli.station.records import TWICE_MAX, passed_twice_lines
+from flasher.cli.station.records import passed_twice_lines
 from flasher.errors import ExitCode, UsageError
-from flasher.plant.activity import Yield
 from flasher.plant.alerts import (
     Bounds,
     CheckKind,
@@ -37,7 +36,8 @@ from flasher.plant.store import passed_twice
 from flasher.protocol.text import printable
 from flasher.station.config import load_config
 from flasher.station.records.database import Location
-from flasher.station.records.model import RunState
+from flasher.station.records.model import RunState, Units
+from flasher.station.reports import TWICE_MAX
 from flasher.station.shift_counts import DEFAULT_SHIFTS
 
 
@@ -133,13 +133,7 @@ def status(output: Output, url: str, options: BoundsOptions) -> int:
     code = ExitCode.PARTIAL if any(alerts(found)) else ExitCode.OK
     if any(each.status.refusal for each in found):
         code = ExitCode.VERIFICATION
-    document = PlantStatusDocument(
-        [each.status for each in found],
-        {each.status.station: each.activity for each in found},
-        {each.status.station: each.checks for each in found},
-        twice,
-    )
-    return output.document(document, exit_code=code)
+    return output.document(PlantStatusDocument(found, twice), exit_code=code)
 
 
 def _lines(of: StationOverview) -> Iterator[str]:
@@ -182,8 +176,8 @@ def _lines(of: StationOverview) -> Iterator[str]:
             yield printable(f"  not known: {check.kind.value}: {check.text}")
 
 
-def _yield_text(found: Yield) -> str:
-    share = "" if found.share is None else f" ({found.share:.1%})"
+def _yield_text(found: Units) -> str:
+    share = "" if found.yield_share is None else f" ({found.yield_share:.1%})"
     return f"{found.passed:,} of {counted(found.units, 'unit')}{share}"
 
 

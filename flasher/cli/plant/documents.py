@@ -5,9 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from flasher.cli.station.documents import StationReportDocument
-from flasher.plant.activity import Activity
-from flasher.plant.alerts import StationCheck
+from flasher.plant.alerts import StationOverview
 from flasher.plant.claim_list import ReleasedClaim, UnitClaim
 from flasher.plant.deliveries import DeliveryState, RunDocument
 from flasher.plant.delivery_list import Delivery, ReceiverStatus
@@ -16,10 +14,10 @@ from flasher.plant.forwarder import ForwarderState
 from flasher.plant.recipes import RecipeEvent
 from flasher.plant.reconcile import Reconciliation
 from flasher.plant.retire import DueMonth, RetiredMonth
-from flasher.plant.stations import StationStatus
 from flasher.plant.verify import PlantExamination
 from flasher.station.records.model import PassedTwice
 from flasher.station.records.overview import ImageRecord, InstalledUnit
+from flasher.station.reports import Report
 
 
 @dataclass(frozen=True)
@@ -38,11 +36,7 @@ class PlantInitDocument:
 class PlantStatusDocument:
     """The stations of a plant."""
 
-    stations: list[StationStatus]
-    activity: dict[str, Activity]
-    """What each station has done lately, by its name."""
-    checks: dict[str, tuple[StationCheck, ...]]
-    """Checks of each station by its name."""
+    stations: list[StationOverview]
     passed_twice: list[PassedTwice]
     """The newest 100 units that passed at two stations, without a recipe that asked for it."""
 
@@ -136,7 +130,7 @@ DOCUMENTS: Final = (
     PlantExamination,
     PlantRetireDocument,
     PlantUnitsDocument,
-    StationReportDocument,
+    Report,
     PlantInitDocument,
     PlantStatusDocument,
     PlantSendDocument,

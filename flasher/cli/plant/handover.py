@@ -8,7 +8,6 @@ from contextlib import closing
 from pathlib import Path
 from typing import Final
 
-from flasher.cli.documents import SCHEMA_VERSION
 from flasher.cli.extras import need
 from flasher.cli.output import Output, counted, utc_time
 from flasher.cli.plant.commands import DeliveryOptions
@@ -52,7 +51,7 @@ def deliver(output: Output, url: str, file: Path, *, once: bool) -> int:
         names = ", ".join(each.name for each in receivers)
         output.progress(f"delivers to {names}{'' if once else ' until Ctrl-C'}")
 
-    courier = Courier(url, receivers, SCHEMA_VERSION, count, output.progress, begun)
+    courier = Courier(url, receivers, count, output.progress, begun)
     with closing(courier), stop_on_signal() as stop:
         courier.deliver(stop, once=once)
     made = ", ".join(f"{count:,} {state}" for state, count in sorted(counts.items()))
@@ -108,7 +107,7 @@ def deliveries(
                 again = [DeliveryFilter(row.receiver, key=row.key) for row in rows[:limit]]
                 rows = tuple(row for each in again for row in deliveries_of(connection, each).rows)
         has_document = chosen.key is not None and rows
-        document = found.document(str(chosen.key), SCHEMA_VERSION) if has_document else None
+        document = found.document(str(chosen.key)) if has_document else None
     output.results(_receiver_lines(known))
     output.results(printable(line) for row in rows for line in _lines(row))
     return output.document(PlantDeliveriesDocument(known, list(rows), document))

@@ -121,7 +121,7 @@ def check(output: Output, path: Path, station_file: Path | None) -> int:
                     sha256=target.image.sha256,
                     size_bytes=target.image.size_bytes,
                     version=target.version,
-                    required=target.required.words,
+                    required=target.required,
                 )
                 for target in recipe.targets
             ],

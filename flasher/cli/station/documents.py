@@ -5,20 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, get_args
 
-from flasher.cli.documents import document_of
-from flasher.station.events import RunEnded, ScanRefused, StationEvent
+from flasher.station.events import ScanRefused, StationEvent
 from flasher.station.records.branch import BroughtIn
-from flasher.station.records.capability import Capability
 from flasher.station.records.model import (
     Backup,
     Examination,
     Figures,
-    PassedTwice,
-    ReportedRun,
-    RunState,
+    RunRecord,
     UnitLife,
+    Verified,
 )
 from flasher.station.records.upgrade import Upgraded
+from flasher.station.reports import Report
 from flasher.station.sealed import CheckedCertificate
 from flasher.trace.story import Cause, Story
 
@@ -42,8 +40,7 @@ class CheckedTargetDocument:
     size_bytes: int
     version: str
     """Empty when neither image nor manifest has one."""
-    required: str
-    """Required verification level, in words."""
+    required: Verified
 
 
 @dataclass(frozen=True)
@@ -69,29 +66,6 @@ class FindingsDocument:
 
 
 @dataclass(frozen=True)
-class FiguresDocument:
-    """Figures of runs, without golden units."""
-
-    runs: int
-    units: int
-    """Number of units with a run that ended in PASS or FAIL."""
-    passed: int
-    first_passed: int
-    """Number of units whose first such run is a PASS."""
-    yield_share: float | None
-    """From 0 to 1; null without units."""
-    first_pass_share: float | None
-    by_state: dict[str, int]
-    failures: dict[str, int]
-    """Number of runs that ended without PASS, by code."""
-    duration_median_s: float | None
-    """Median over runs that passed."""
-    duration_longest_s: float | None
-    virtual_runs: int
-    """Number of runs of virtual units, included in the counts above."""
-
-
-@dataclass(frozen=True)
 class StationRunDocument:
     """Result of `flasher station run`."""
 
@@ -102,24 +76,11 @@ class StationRunDocument:
     """Path or URL of the records; "" for temporary records of virtual units."""
     is_complete: bool
     """False if the station ended before all scans, or all virtual units, were done."""
-    figures: FiguresDocument | None
+    figures: Figures | None
     """null when they cannot be read."""
-    units: list[RunEnded]
+    units: list[RunRecord]
     """The last run of each unit."""
     refused: list[ScanRefused]
-
-
-@dataclass(frozen=True)
-class StationReportDocument:
-    """Runs with their figures."""
-
-    figures: FiguresDocument
-    measurements: list[Capability]
-    """Measurements with limits."""
-    runs: list[ReportedRun]
-    passed_twice: list[PassedTwice]
-    """Of a plant: the newest 100 units that passed at two stations, without a recipe that asked
-    for it, whatever runs were chosen."""
 
 
 @dataclass(frozen=True)
@@ -211,7 +172,7 @@ DOCUMENTS: Final = (
     StationCheckDocument,
     FindingsDocument,
     StationRunDocument,
-    StationReportDocument,
+    Report,
     UnitDocument,
     Backup,
     Examination,
@@ -226,8 +187,3 @@ DOCUMENTS: Final = (
 )
 LINES: Final[tuple[type, ...]] = get_args(StationEvent)
 """Events that a station prints as JSON lines."""
-
-
-def figures_document(figures: Figures) -> FiguresDocument:
-    by_state = {RunState(state).name.lower(): n for state, n in figures.by_state.items()}
-    return document_of(FiguresDocument, figures, by_state=by_state, failures=dict(figures.failures))

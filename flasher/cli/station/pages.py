@@ -38,9 +38,9 @@ from flasher.station.health import HealthCheck, HealthWatch
 from flasher.station.operators import BADGES, Person
 from flasher.station.pins import checker
 from flasher.station.records.keys import KeyLocations
-from flasher.station.records.model import RunFilter, RunKind, RunState, StationClock, utc_moment
+from flasher.station.records.model import RunFilter, RunKind, RunState, StationClock
 from flasher.station.records.store import Store, SystemClock
-from flasher.station.shift_counts import DEFAULT_SHIFTS, EndedRun, ShiftCounts
+from flasher.station.shift_counts import DEFAULT_SHIFTS, ShiftCounts
 from flasher.station.station import Station
 from flasher.web.guard import BODY_MAX, application
 from flasher.web.login import Badges, Login
@@ -83,8 +83,8 @@ class OperatorView:
 
     def show(self, event: StationEvent) -> None:
         """Show an event that the board has applied."""
-        if isinstance(event, RunEnded) and event.kind is not RunKind.GOLDEN:
-            self._good[event.serial] = event.outcome is RunState.PASS
+        if isinstance(event, RunEnded) and event.run.kind is not RunKind.GOLDEN:
+            self._good[event.serial] = event.run.state is RunState.PASS
         self._screen.show(event, self._board)
 
     def turn(self) -> None:
@@ -125,7 +125,7 @@ def operator_page(
     store = station.store
     for run in store.read.table(RunFilter(since=began)):
         if run.station == store.station and run.state is not RunState.RUNNING:
-            tally.add(EndedRun(utc_moment(run.begun_at), run.serial, run.state, run.code))
+            tally.add(run)
     clock = station.clock
     watch = HealthWatch(
         store.files.folder,

@@ -15,10 +15,8 @@ from flasher.cli.look.explain_text import story_lines
 from flasher.cli.output import Output, counted, duration, utc_time
 from flasher.cli.station.commands import RecordsOptions, ReportOptions
 from flasher.cli.station.documents import (
-    StationReportDocument,
     UnitDocument,
     UnitTraceDocument,
-    figures_document,
 )
 from flasher.cli.station.place import open_to_read
 from flasher.cli.station.views import figures_line
@@ -27,7 +25,6 @@ from flasher.protocol.text import printable
 from flasher.station.records.capability import VALUES_MIN, Basis, Capability
 from flasher.station.records.errors import NotFoundError, UnprovenError
 from flasher.station.records.model import (
-    CHECKED,
     RELEASED_MARK,
     TORN_TRACE,
     TRACE,
@@ -43,13 +40,11 @@ from flasher.station.records.model import (
     WriteRecord,
 )
 from flasher.station.records.store import Store
-from flasher.station.reports import Report
+from flasher.station.reports import TWICE_MAX, Report
 from flasher.station.stories import explained
 from flasher.trace.story import Story
 from flasher.wording import wording
 
-TWICE_MAX: Final = 100
-"""Units that passed at two stations that reports show."""
 _NO_VERDICT: Final = (RunState.ERROR, RunState.ABORTED, RunState.INTERRUPTED)
 
 
@@ -82,11 +77,10 @@ def report(
         if first is not None and (chosen.since is None or chosen.since < first):
             output.progress(f"note: runs before {first:%Y-%m-%d} are retired and not counted")
             chosen = replace(chosen, since=first)
-        made = Report(store.read, chosen)
+        made = Report(store, chosen)
         output.results(figure_lines(made.figures))
-        output.results(capability_lines(made.capabilities))
-        twice = list(store.passed_twice(TWICE_MAX))
-        output.results(passed_twice_lines(twice))
+        output.results(capability_lines(made.measurements))
+        output.results(passed_twice_lines(made.passed_twice))
         for option, (path, make) in wanted.items():
             if path is not None:
                 write_whole(path, make(made).encode("utf-8"), option)
@@ -98,13 +92,7 @@ def report(
             code = ExitCode.VERIFICATION
         if not output.json_wanted:
             return code  # the runs are read for the document alone
-        document = StationReportDocument(
-            figures=figures_document(made.figures),
-            measurements=made.capabilities,
-            runs=made.runs,
-            passed_twice=twice,
-        )
-        return output.document(document, exit_code=code)
+        return output.document(made, exit_code=code)
 
 
 def _check_station(store: Store, station: str | None) -> None:
@@ -241,8 +229,8 @@ def passed_twice_lines(found: Sequence[PassedTwice]) -> Iterator[str]:
     )
     for each in found:
         runs = (
-            f"{run.station}, socket {run.socket}, {run.begun_at[:19].replace('T', ' ')} UTC"
-            + ("" if run.duplicates in (None, CHECKED) else ", duplicates NOT CHECKED")
+            f"{run.station}, socket {run.socket}, {utc_time(run.begun_at)}"
+            + (", duplicates NOT CHECKED" if run.is_unchecked else "")
             for run in (each.first, each.second)
         )
         nature = ", VIRTUAL" if each.is_virtual else ""
@@ -251,7 +239,7 @@ def passed_twice_lines(found: Sequence[PassedTwice]) -> Iterator[str]:
 
 def figure_lines(figures: Figures) -> Iterator[str]:
     yield figures_line(figures)
-    open_runs = {state: figures.by_state.get(state.value, 0) for state in _NO_VERDICT}
+    open_runs = {state: figures.by_state.get(state, 0) for state in _NO_VERDICT}
     words = [f"{count:,} {state.value}" for state, count in open_runs.items() if count]
     yield f"  runs:     {figures.runs:,}" + (f", of them {', '.join(words)}" if words else "")
     if figures.virtual_runs:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 from flasher.cli.extras import need
 from flasher.cli.output import Output
 from flasher.cli.station.commands import PagesOptions, RecordsOptions, RunOptions
-from flasher.cli.station.documents import StationRunDocument, figures_document
+from flasher.cli.station.documents import StationRunDocument
 from flasher.cli.station.place import operator_of, records_of
 from flasher.cli.station.scans import LineReader, ScanFile, Typing, keyboard, read_scans
 from flasher.cli.station.setup import (
@@ -478,9 +478,8 @@ class _Session:
         if board.figures is not None:
             yield figures_line(board.figures)
         for each in board.bad_units:
-            text = f"{each.outcome.value:<8} {each.serial}, socket {each.socket}: {each.code}: "
+            text = f"{each.state.value:<8} {each.serial}, socket {each.socket}: {each.code}: "
             yield printable(text + each.text)
-            yield printable(f"{'':8} {each.action}")
         for label in self._not_done():
             last = next(each for each in reversed(board.refused) if each.text == label)
             yield printable(f"{'refused':<8} {label}: {last.code}: {last.reason} {last.remedy}")
@@ -492,7 +491,7 @@ class _Session:
         location = self.store.database.location
         figures = None
         with suppress(RecordError):
-            figures = figures_document(self.station.figures)
+            figures = self.station.figures
         return StationRunDocument(
             station=self.store.station,
             recipe=recipe.name,

@@ -24,7 +24,7 @@ from flasher.protocol.text import printable
 from flasher.station import events
 from flasher.station.board import NO_BADGES, Board, Row, device_event_text
 from flasher.station.events import LineStopped, SocketState, StationEvent
-from flasher.station.records.model import Figures
+from flasher.station.records.model import Figures, RunState
 
 WIDE: Final = 140
 """Terminal width from which the instruction is in the row instead of below it."""
@@ -300,11 +300,13 @@ def _socket_words(event: StationEvent) -> str:
             cause = f" {event.code}: {event.text}" if event.code else ""
             name = f"{step.value} {event.target}".strip()
             return f"{serial}  {name}: {state.value}, {duration_s:.2f} s{cause}"
-        case events.RunEnded():
-            code = "" if event.code == "OK" else f" {event.code}"
-            text = event.text.rstrip(". ")
-            nature = " (virtual unit)" if event.is_virtual else ""
-            return f"{event.serial}  {event.outcome.value}{nature}{code}: {text}. {event.action}"
+        case events.RunEnded(run, action):
+            if run.state is RunState.PASS:
+                code, text = "", f"{run.text}. {action}"
+            else:
+                code, text = f" {run.code}", run.text  # with the action
+            nature = " (virtual unit)" if run.is_virtual else ""
+            return f"{run.serial}  {run.state.value}{nature}{code}: {text}"
         case events.SocketChanged(_, events.SocketState.ERROR, _, text):
             return f"ERROR: {text}"
         case events.RecordNotSaved(_, serial, _, reason, remedy):

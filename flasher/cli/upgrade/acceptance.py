@@ -18,7 +18,7 @@ import click
 from flasher import __version__, api
 from flasher.cli import values
 from flasher.cli.adapters import choose_adapter
-from flasher.cli.documents import ImageDocument, as_json
+from flasher.cli.documents import ImageDocument
 from flasher.cli.files import check_new, check_not_read, claimed, write_whole
 from flasher.cli.framework import command, option, rebuild_command_line
 from flasher.cli.look.doctor import LISTEN_S, Diagnostics
@@ -39,6 +39,7 @@ from flasher.cli.upgrade import text
 from flasher.cli.upgrade.choices import EXIT_CODES
 from flasher.cli.upgrade.progress import Progress
 from flasher.cli.upgrade.upgrade_run import UpgradeRun
+from flasher.documents import as_json
 from flasher.errors import ErrorCode, ExitCode, FlasherError, InterruptedByUserError, UsageError
 from flasher.events import PacketAcknowledged
 from flasher.host.outcome import AGAIN, DeviceLeft

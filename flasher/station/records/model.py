@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, date, datetime
 from enum import IntEnum, StrEnum
 from pathlib import Path
-from typing import Final, NewType, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Final, NewType, Protocol
 
 from flasher.validation import LowerCaseInJson, json_keys
+
+if TYPE_CHECKING:
+    from pydantic_core import CoreSchema
 
 RunId = NewType("RunId", int)
 WriteId = NewType("WriteId", int)
@@ -36,6 +39,27 @@ def utc_text(moment: datetime) -> str:
         raise ValueError("the time has no time zone")
     # isoformat: a report formats tens of thousands, and strftime takes twenty times as long.
     return moment.astimezone(UTC).isoformat(timespec="microseconds").removesuffix("+00:00") + "Z"
+
+
+class UtcTextInJson:
+    """Writes a time as `utc_text` in JSON: a time without microseconds is no shorter."""
+
+    @classmethod
+    def __get_pydantic_core_schema__(
+        cls, source: Any, handler: Callable[[Any], CoreSchema]
+    ) -> CoreSchema:
+        from pydantic_core import core_schema  # noqa: PLC0415
+
+        schema: Any = handler(source)
+        written = core_schema.plain_serializer_function_ser_schema(utc_text, when_used="json")
+        return {**schema, "serialization": written}
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, _schema: Any, _handler: Any) -> dict[str, Any]:
+        return {"type": "string", "format": "date-time"}
+
+
+Moment = Annotated[datetime, UtcTextInJson]
 
 
 def utc_moment(text: str) -> datetime:
@@ -142,7 +166,7 @@ class StepName(StrEnum):
     SAVE = "save"
 
 
-class Verified(IntEnum):
+class Verified(LowerCaseInJson, IntEnum):
     """Verification level of a target; a stricter level is greater."""
 
     COMPLETED = 0
@@ -174,7 +198,7 @@ the unit has passed at another station."""
 CHECKED: Final = "checked"
 RELEASED_MARK: Final = f"not {CHECKED}: its claim was released"
 """Instead of that measurement, for a run that reached the plant after the claim of its unit was
-released; as `ReportedRun.duplicates`."""
+released; as `RunRecord.duplicates`."""
 PLANT_CLAIM: Final = "plant claim"
 """Measurement of the step `plant`: the claim of the unit in the plant's database."""
 PLANT_ANSWER: Final = "plant answer"
@@ -384,7 +408,7 @@ class StepRecord:
     name: str
     try_number: int
     state: StepState
-    begun_at: datetime
+    begun_at: Moment
     duration_s: float
     code: str
     text: str
@@ -399,8 +423,8 @@ class WriteRecord:
     target: str
     what: str
     value: str
-    intended_at: datetime
-    verified_at: datetime | None
+    intended_at: Moment
+    verified_at: Moment | None
     read_back: str | None
     """Value read back; None if it was not or cannot be read."""
 
@@ -421,7 +445,7 @@ class TargetRecord:
 
 @dataclass(frozen=True)
 class RunRecord:
-    """A recorded run, without its targets, steps, writes and attachments."""
+    """A recorded run, without its targets, steps, writes and attachments. Times are in UTC."""
 
     run_id: RunId
     serial: str
@@ -430,14 +454,13 @@ class RunRecord:
     kind: RunKind
     is_virtual: bool
     """True for a run of a virtual unit."""
-    reason: str
     state: RunState
     code: str
     text: str
-    begun_at: datetime
-    ended_at: datetime | None
+    begun_at: Moment
+    ended_at: Moment | None
     duration_s: float | None
-    """None for an active run, and for an interrupted one, whose end is unknown."""
+    """null for an active run, and for an interrupted one, whose end is unknown."""
     station: str
     socket: str
     operator: str
@@ -445,47 +468,17 @@ class RunRecord:
     recipe_revision: str
     recipe_sha256: str
     verified: Verified | None
-    """Lowest level of its targets; None if unknown."""
+    """Lowest level of its targets; null if unknown."""
     log_sha256: str | None
+    reason: str
     duplicates: str | None = None
-    """As in `ReportedRun`."""
+    """Whether the unit has passed at another station was "checked", or "not checked" with the
+    reason; null: the station belongs to no plant."""
 
     @property
     def is_unchecked(self) -> bool:
         """True if it was not checked whether the unit has passed at another station."""
         return self.duplicates not in (None, CHECKED)
-
-
-@dataclass(frozen=True)
-class ReportedRun:
-    """A run. Times are in UTC."""
-
-    run_id: int
-    serial: str
-    part: str
-    lot: str | None
-    kind: RunKind
-    is_virtual: bool
-    """The unit was virtual: no product."""
-    state: RunState
-    code: str
-    text: str
-    begun_at: str
-    ended_at: str | None
-    duration_s: float | None
-    station: str
-    socket: str
-    operator: str
-    recipe: str
-    recipe_revision: str
-    recipe_sha256: str
-    verified: str | None
-    """The lowest level among its targets: completed, version or memory."""
-    log_sha256: str | None
-    reason: str
-    duplicates: str | None
-    """Whether the unit has passed at another station was "checked", or "not checked" with the
-    reason; null: the station belongs to no plant."""
 
 
 @dataclass(frozen=True)
@@ -519,39 +512,37 @@ class UnitLife:
         return self.runs[-1] if self.runs else None
 
 
-@dataclass(frozen=True)
-class PassedRun:
-    """A run that passed."""
-
-    run_id: int
-    station: str
-    socket: str
-    begun_at: str
-    duplicates: str | None
-    """As in `ReportedRun`."""
-
-
+@json_keys("serial part is_virtual first second")
 @dataclass(frozen=True)
 class PassedTwice:
     """A unit that passed at two stations of a plant, without a recipe that asked for it."""
 
-    serial: str
-    part: str
-    is_virtual: bool
-    first: PassedRun
+    first: RunRecord
     """The PASS that the plant's database had first."""
-    second: PassedRun
+    second: RunRecord
+
+    @property
+    def serial(self) -> str:
+        return self.second.serial
+
+    @property
+    def part(self) -> str:
+        return self.second.part
+
+    @property
+    def is_virtual(self) -> bool:
+        return self.second.is_virtual
 
 
 @dataclass(frozen=True)
 class RunFilter:
-    """Selects runs by their properties; None means any."""
+    """Selects runs by their properties; null means any."""
 
     lot: str | None = None
     recipe: str | None = None
-    since: datetime | None = None
+    since: Moment | None = None
     """Earliest start of a run."""
-    until: datetime | None = None
+    until: Moment | None = None
     """Runs start before this time."""
     serial: str | None = None
     part: str | None = None
@@ -563,35 +554,46 @@ class RunFilter:
     station: str | None = None
 
 
-@dataclass(frozen=True)
-class Figures:
-    """Figures of a report, without golden units."""
+@json_keys("units passed first_passed yield_share first_pass_share")
+@dataclass
+class Units:
+    """Counts of units, without golden ones."""
 
-    runs: int
-    units: int
+    units: int = 0
     """Number of units with a run that ended in PASS or FAIL."""
-    passed: int
+    passed: int = 0
     """Number of units whose last such run is a PASS."""
-    first_passed: int
+    first_passed: int = 0
     """Number of units whose first such run is a PASS."""
-    by_state: Mapping[str, int]
-    failures: Mapping[str, int]
-    """Number of runs that ended without PASS, by code, most frequent first."""
-    duration_median_s: float | None
-    """Median over runs that passed."""
-    duration_longest_s: float | None
-    virtual_runs: int = 0
-    """Number of runs of virtual units, included in the counts above."""
 
     @property
     def yield_share(self) -> float | None:
-        """Yield: `passed` divided by `units`, from 0 to 1; None without units."""
+        """Yield: `passed` divided by `units`, from 0 to 1; null without units."""
         return self.passed / self.units if self.units else None
 
     @property
     def first_pass_share(self) -> float | None:
-        """First-pass yield: `first_passed` divided by `units`, from 0 to 1; None without units."""
+        """First-pass yield: `first_passed` divided by `units`, from 0 to 1; null without units."""
         return self.first_passed / self.units if self.units else None
+
+
+@json_keys(
+    "runs units passed first_passed yield_share first_pass_share by_state failures"
+    " duration_median_s duration_longest_s virtual_runs"
+)
+@dataclass
+class Figures(Units):
+    """Figures of runs, without golden units."""
+
+    runs: int = 0
+    by_state: Mapping[RunState, int] = field(default_factory=dict)
+    failures: Mapping[str, int] = field(default_factory=dict)
+    """Number of runs that ended without PASS, by code, most frequent first."""
+    duration_median_s: float | None = None
+    """Median over runs that passed."""
+    duration_longest_s: float | None = None
+    virtual_runs: int = 0
+    """Number of runs of virtual units, included in the counts above."""
 
 
 @dataclass(frozen=True)

@@ -24,24 +24,25 @@ from flasher.station.records.database import Database
 from flasher.station.records.filters import JUDGED, counting
 from flasher.station.records.model import (
     FLASH,
+    Moment,
     RunDetails,
     RunFilter,
     RunId,
     RunRecord,
     RunState,
     StepState,
+    Units,
     utc_moment,
     utc_text,
 )
 from flasher.station.records.newest import PageCursor, newest_runs
-from flasher.station.records.queries import VERIFIED, details_of, run_query
+from flasher.station.records.queries import RUN_QUERY, details_of, valid
 from flasher.station.records.rollup import (
     ALL_SPANS,
     WITHOUT_CAUSE,
     Rest,
     Rollup,
     StepTimes,
-    Units,
     rounded_s,
 )
 from flasher.station.records.rows import beside_index
@@ -86,7 +87,7 @@ class InstalledUnit:
     run_id: RunId
     state: RunState
     """State of the run with that transfer."""
-    begun_at: datetime
+    begun_at: Moment
     target: str
     is_confirmed: bool
     """The device confirmed the transfer; otherwise it may hold a part of the image, or none."""
@@ -123,10 +124,10 @@ class AuditRow:
     hash: str
 
 
-_ROWS: Final = TypeAdapter(tuple[dict[str, Any], ...])
-_RUNS: Final = TypeAdapter(tuple[RunRecord, ...])
-_HOLDERS: Final = TypeAdapter(tuple[InstalledUnit, ...])
-_AUDIT: Final = TypeAdapter(tuple[AuditRow, ...])
+_ANY: Final = TypeAdapter(dict[str, Any])
+_RUN: Final = TypeAdapter(RunRecord)
+_HOLDER: Final = TypeAdapter(InstalledUnit)
+_AUDIT: Final = TypeAdapter(AuditRow)
 
 
 class Overview:
@@ -140,16 +141,7 @@ class Overview:
         run_id = schema.run.c.id
         with self._database.reading() as connection:
             found = newest_runs(connection, chosen, cursor, size + 1)
-        query = run_query(schema.run.c.verification_reached.label("verified"))
-        # Pages leave out invalid rows; reports and `verify` report them.
-        return self._page(_RUNS, query.where(run_id.in_(found)), run_id, cursor, size)
-
-    def rows(self, chosen: RunFilter, cursor: PageCursor, size: int) -> Page[dict[str, Any]]:
-        """A page of runs in the format of reports (`Records.table`)."""
-        with self._database.reading() as connection:
-            found = newest_runs(connection, chosen, cursor, size + 1)
-        run_id = schema.run.c.id
-        return self._page(_ROWS, run_query(VERIFIED).where(run_id.in_(found)), run_id, cursor, size)
+        return self._page(_RUN, RUN_QUERY.where(run_id.in_(found)), run_id, cursor, size)
 
     def parts(self, serial: str) -> tuple[str, ...]:
         unit = schema.unit.c
@@ -163,7 +155,7 @@ class Overview:
         run_id = schema.run.c.id
         with self._database.reading() as connection:
             last = newest_runs(connection, RunFilter(serial=serial, part=part), cursor, size + 1)
-        page = self._page(_ROWS, select(run_id).where(run_id.in_(last)), run_id, cursor, size)
+        page = self._page(_ANY, select(run_id).where(run_id.in_(last)), run_id, cursor, size)
         with self._database.reading() as connection:
             found = tuple(details_of(connection, run_id.in_([row["id"] for row in page.rows])))
         return Page(found[::-1], page.older, page.newer)
@@ -222,7 +214,7 @@ class Overview:
     ) -> Page[InstalledUnit]:
         """A page of the units whose last transfer to a target was of this image."""
         query = _holders(self._artifacts(sha256))
-        return self._page(_HOLDERS, query, schema.run_target.c.id, cursor, size)
+        return self._page(_HOLDER, query, schema.run_target.c.id, cursor, size)
 
     def holder_count(self, sha256: str) -> int:
         """Number of these units, counted up to `HOLDERS_COUNTED` plus one."""
@@ -371,7 +363,7 @@ class Overview:
 
     def _page(
         self,
-        rows_of: TypeAdapter[tuple[_Row, ...]],
+        kind: TypeAdapter[_Row],
         query: Select[Any],
         row_id: Any,
         cursor: PageCursor,
@@ -383,7 +375,7 @@ class Overview:
         has_more = len(rows) > size
         rows = rows[:size]
         ids = [row.pop("cursor_id") for row in rows]
-        return page_of(rows_of.validate_python(rows), ids, cursor, has_more=has_more)
+        return page_of([valid(kind, row) for row in rows], ids, cursor, has_more=has_more)
 
 
 def page_of(

@@ -5,16 +5,16 @@ from __future__ import annotations
 import statistics
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
-from pydantic import TypeAdapter
-from sqlalchemy import Connection, Select, case, literal, select
+from pydantic import TypeAdapter, ValidationError
+from sqlalchemy import Connection, Select, literal, select
 
 from flasher.protocol.text import printable
 from flasher.station.records import chain, schema
 from flasher.station.records.capability import Capability, capabilities
 from flasher.station.records.database import Database
-from flasher.station.records.errors import NotFoundError
+from flasher.station.records.errors import NotFoundError, RecordsDamagedError
 from flasher.station.records.filters import JUDGED, counting, filtered
 from flasher.station.records.heads import ChainHead
 from flasher.station.records.model import (
@@ -23,25 +23,21 @@ from flasher.station.records.model import (
     SIGNATURE,
     AuditEvent,
     Figures,
-    ReportedRun,
     RunDetails,
     RunFilter,
     RunId,
-    RunKind,
+    RunRecord,
     RunState,
     StepName,
     UnitLife,
+    Units,
     UnitState,
-    Verified,
 )
-from flasher.station.records.rollup import EndCounts, Rest, Rollup, Units
+from flasher.station.records.rollup import EndCounts, Rest, Rollup
 from flasher.station.records.rows import batches
 
 _EVERYTHING: Final = RunFilter()
-VERIFIED: Final = case(
-    {int(level): level.name.lower() for level in Verified}, value=schema.run.c.verification_reached
-).label("verified")
-"""Verification level of a run, as a word."""
+_Row = TypeVar("_Row")
 _DUPLICATES: Final = (
     select(schema.measurement.c.text)
     .join_from(schema.step, schema.measurement)
@@ -54,7 +50,42 @@ _DUPLICATES: Final = (
     .scalar_subquery()
     .label("duplicates")
 )
+_OF: Final = schema.run.c
+RUN_QUERY: Final = (
+    select(
+        _OF.id.label("run_id"),
+        schema.unit.c.serial,
+        schema.unit.c.part,
+        schema.lot.c.name.label("lot"),
+        _OF.kind,
+        _OF.is_virtual,
+        _OF.reason,
+        _OF.state,
+        _OF.code,
+        _OF.text,
+        _OF.begun_at,
+        _OF.ended_at,
+        (_OF.ended_monotonic_s - _OF.begun_monotonic_s).label("duration_s"),
+        schema.station.c.name.label("station"),
+        schema.socket.c.name.label("socket"),
+        schema.operator.c.name.label("operator"),
+        schema.recipe.c.name.label("recipe"),
+        schema.recipe.c.revision.label("recipe_revision"),
+        schema.recipe.c.sha256.label("recipe_sha256"),
+        _OF.verification_reached.label("verified"),
+        _OF.log_sha256,
+        _DUPLICATES,
+    )
+    .join_from(schema.run, schema.unit, _OF.unit_id == schema.unit.c.id)
+    .join(schema.recipe, _OF.recipe_id == schema.recipe.c.id)
+    .outerjoin(schema.lot, _OF.lot_id == schema.lot.c.id)
+    .join(schema.socket, _OF.socket_id == schema.socket.c.id)
+    .join(schema.station, schema.socket.c.station_id == schema.station.c.id)
+    .join(schema.operator, _OF.operator_id == schema.operator.c.id)
+)
+"""Query of runs with the columns of `RunRecord`."""
 _DETAILS: Final = TypeAdapter(RunDetails)
+_RUN: Final = TypeAdapter(RunRecord)
 _NAMED: Final = ("unit", "station", "socket", "operator", "recipe")
 """Columns with a name that every run has."""
 
@@ -66,22 +97,12 @@ class Records:
         self._database = database
         self._rollup = Rollup(database)
 
-    def table(self, chosen: RunFilter = _EVERYTHING) -> list[ReportedRun]:
+    def table(self, chosen: RunFilter = _EVERYTHING) -> list[RunRecord]:
         """The runs of a filter, for reports."""
-        query = filtered(run_query(VERIFIED), chosen).order_by(schema.run.c.id)
-        marks = dict.fromkeys(self.released(), RELEASED_MARK)
+        query = filtered(RUN_QUERY, chosen).order_by(schema.run.c.id)
+        released = self.released()
         with self._database.reading() as connection:
-            return [
-                ReportedRun(
-                    **{
-                        **row,
-                        "kind": RunKind(row["kind"]),
-                        "state": RunState(row["state"]),
-                        "duplicates": marks.get(row["run_id"], row["duplicates"]),
-                    }
-                )
-                for row in connection.execute(query).mappings()
-            ]
+            return runs_of(connection, query, released)
 
     def released(self) -> set[int]:
         """Runs that reached the plant after the claim of their unit was released. What they
@@ -168,7 +189,7 @@ class Records:
         return Figures(
             runs=ended.by_state.total(),
             **asdict(units),
-            by_state=dict(ended.by_state),
+            by_state={RunState(state): count for state, count in ended.by_state.items()},
             virtual_runs=ended.virtual_runs,
             failures=dict(failures),
             duration_median_s=statistics.median(ended.durations_s) if ended.durations_s else None,
@@ -226,15 +247,49 @@ class Records:
             )
 
 
+def runs_of(
+    connection: Connection, query: Select[Any], released: Collection[int]
+) -> list[RunRecord]:
+    """Runs of a `RUN_QUERY`, those in `released` with their mark. Raises RecordsDamagedError."""
+    marks = dict.fromkeys(released, RELEASED_MARK)
+    rows = connection.execute(query).mappings()
+    return [
+        valid(_RUN, {**row, "duplicates": marks.get(row["run_id"], row["duplicates"])})
+        for row in rows
+    ]
+
+
+def valid(kind: TypeAdapter[_Row], row: Mapping[str, Any]) -> _Row:
+    """The value of a row. Raises RecordsDamagedError for values that no station writes."""
+    try:
+        return kind.validate_python(row)
+    except ValidationError as error:
+        raise _damaged(error, row.get("run_id")) from error
+
+
+def _damaged(error: ValidationError, run_id: object) -> RecordsDamagedError:
+    wrong = error.errors()[0]
+    name = ".".join(map(str, wrong["loc"]))
+    return RecordsDamagedError(
+        "The records contain a value that no station writes.",
+        where=printable(name if run_id is None else f"run {run_id}, {name}"),
+        cause=printable(f"{wrong['msg']}: {wrong['input']!r}"[:200]),
+        remedy="List all problems with flasher station verify.",
+    )
+
+
 def details_of(connection: Connection, chosen: Any) -> Iterator[RunDetails]:
     """Runs that meet an SQL condition, with their parts, in order of ids; runs that refer to
-    missing rows are left out. Raises ValidationError for values that no station writes.
+    missing rows are left out. Raises RecordsDamagedError for values that no station writes.
     """
     run_ids = connection.execute(select(schema.run.c.id).where(chosen).order_by(schema.run.c.id))
     for some in batches(run_ids.scalars().all()):
-        for content in chain.contents_of(connection, some).values():
+        for run_id, content in chain.contents_of(connection, some).items():
             if is_whole(content):
-                yield details_of_content(content, content["recipe"])
+                try:
+                    yield details_of_content(content, content["recipe"])
+                except ValidationError as error:
+                    raise _damaged(error, run_id) from error
 
 
 def is_whole(content: Mapping[str, Any]) -> bool:
@@ -284,41 +339,4 @@ def details_of_content(content: Mapping[str, Any], recipe: Mapping[str, str]) ->
             "writes": [each | {"write_id": each["id"]} for each in content["writes"]],
             "attachments": content["attachments"],
         }
-    )
-
-
-def run_query(verified: Any) -> Select[Any]:
-    """Query of runs with the columns of `RunRecord`."""
-    run = schema.run.c
-    return (
-        select(
-            run.id.label("run_id"),
-            schema.unit.c.serial,
-            schema.unit.c.part,
-            schema.lot.c.name.label("lot"),
-            run.kind,
-            run.is_virtual,
-            run.state,
-            run.code,
-            run.text,
-            run.begun_at,
-            run.ended_at,
-            (run.ended_monotonic_s - run.begun_monotonic_s).label("duration_s"),
-            schema.station.c.name.label("station"),
-            schema.socket.c.name.label("socket"),
-            schema.operator.c.name.label("operator"),
-            schema.recipe.c.name.label("recipe"),
-            schema.recipe.c.revision.label("recipe_revision"),
-            schema.recipe.c.sha256.label("recipe_sha256"),
-            verified,
-            run.log_sha256,
-            run.reason,
-            _DUPLICATES,
-        )
-        .join_from(schema.run, schema.unit, run.unit_id == schema.unit.c.id)
-        .join(schema.recipe, run.recipe_id == schema.recipe.c.id)
-        .outerjoin(schema.lot, run.lot_id == schema.lot.c.id)
-        .join(schema.socket, run.socket_id == schema.socket.c.id)
-        .join(schema.station, schema.socket.c.station_id == schema.station.c.id)
-        .join(schema.operator, run.operator_id == schema.operator.c.id)
     )

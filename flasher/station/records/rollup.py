@@ -37,6 +37,7 @@ from flasher.station.records.model import (
     RunKind,
     RunState,
     StepState,
+    Units,
     utc_moment,
     utc_text,
 )
@@ -161,25 +162,6 @@ class EndCounts:
             self.durations_s.append(duration_s or 0.0)
         elif state != RunState.RUNNING.value:
             self.failures[code] += runs
-
-
-@dataclass
-class Units:
-    """Number of units: with a verdict, passed in the last run, passed in the first run."""
-
-    units: int = 0
-    passed: int = 0
-    first_passed: int = 0
-
-    @property
-    def share(self) -> float | None:
-        """Yield, from 0 to 1; None without units."""
-        return self.passed / self.units if self.units else None
-
-    @property
-    def first_share(self) -> float | None:
-        """First-pass yield, from 0 to 1; None without units."""
-        return self.first_passed / self.units if self.units else None
 
 
 class Rollup:

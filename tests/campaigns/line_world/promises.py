@@ -197,13 +197,13 @@ class Promises:
         return frozenset({run.number} if run.had_application and run.is_identified else ())
 
     def _ended(self, event: RunEnded) -> None:
-        run = self._runs.pop(event.socket, None)
-        if event.outcome is RunState.ABORTED and event.socket not in self._aborted:
+        ended, run = event.run, self._runs.pop(event.socket, None)
+        if ended.state is RunState.ABORTED and event.socket not in self._aborted:
             raise Violation(
                 "ABORTED", f"the run of {event.serial} ended as if somebody had aborted it"
             )
         was_changed = event.serial in self._changed
-        if event.code in _OF_ANOTHER:
+        if ended.code in _OF_ANOTHER:
             self._changed.add(event.serial)
         elif run is None or run.has_flashed:
             self._changed.discard(event.serial)
@@ -224,11 +224,12 @@ class Promises:
                 f"a unit without application was flashed as {label}, which was scanned without the"
                 f" card of {event.socket}",
             )
-        if event.outcome is RunState.FAIL and run.was_running:
+        if ended.state is RunState.FAIL and run.was_running:
             raise Violation(
-                "BLAMED", f"{label} was pulled before its flash, and is recorded as {event.code}"
+                "BLAMED",
+                f"{label} was pulled before its flash, and is recorded as {ended.code}",
             )
-        if event.outcome is RunState.PASS and was_changed and not run.has_flashed:
+        if ended.state is RunState.PASS and was_changed and not run.has_flashed:
             raise Violation(
                 "TRUSTED", f"{label} passes without a flash, after a run with a changed unit"
             )

@@ -781,18 +781,18 @@ class World:
             self.promises.flashes(bay.name)
 
     def _end(self, bay: Bay, event: RunEnded) -> None:
-        bay.run = ""
-        self._last_end = f"{event.outcome.value} {event.code}"
+        bay.run, run = "", event.run
+        self._last_end = f"{run.state.value} {run.code}"
         self.seen[self._last_end] += 1
-        if event.code == "INTERNAL":
-            raise Violation("CRASH", f"the run of {event.serial} ended with a bug: {event.text}")
-        if event.code == "UNIT_CHANGED" and _is_calm(bay) and not _has_given_up(bay, self.now):
+        if run.code == "INTERNAL":
+            raise Violation("CRASH", f"the run of {event.serial} ended with a bug: {run.text}")
+        if run.code == "UNIT_CHANGED" and _is_calm(bay) and not _has_given_up(bay, self.now):
             raise Violation(
                 "ACCUSED",
                 f"{event.serial} in {bay.name} was touched by nobody, and is said to be another"
-                f" unit: {event.text}",
+                f" unit: {run.text}",
             )
-        if event.outcome is not RunState.PASS:
+        if run.state is not RunState.PASS:
             return
         self.passed.add(event.serial)
         heard = list(bay.heard)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import math
 from collections.abc import Iterable
 
@@ -126,10 +127,10 @@ def test_without_limits_there_is_none(bench: Bench) -> None:
 
 def test_json_and_csv_have_the_same_numbers(bench: Bench) -> None:
     measure(bench, [value - 12 for value in VALUES], low=-9.0)
-    report = Report(bench.store.read, RunFilter(station="line-2"))
+    report = Report(bench.store, RunFilter(station="line-2"))
     found = only(bench)
     (row,) = csv.DictReader(io.StringIO(report.to_measurements_csv()))
     assert float(row["mean"]) == found.mean == -2.0
     assert float(row["ppk"]) == pytest.approx(found.ppk, rel=1e-8)
-    assert report.to_dict()["measurements"] == [vars(found)]
-    assert Report(bench.store.read, RunFilter(station="line-3")).capabilities == []
+    assert json.loads(report.to_json())["measurements"] == [vars(found)]
+    assert Report(bench.store, RunFilter(station="line-3")).measurements == []
