@@ -26,6 +26,7 @@ from flasher.simulate.independent import (
     NAK,
     REPORT,
     REQUEST,
+    VERSION,
     IndependentDevice,
     frames_of,
 )
@@ -40,6 +41,7 @@ ERROR_FRAME: Final = Frame(0x088, bytes.fromhex("0000020000000000"), is_error=Tr
 _ROUNDING_S: Final = 1e-9
 _HEADER, _GENERAL_FEEDBACK = b"\x55\xaa", FEEDBACK.to_bytes(2, "big")
 _BOOT_VERSION: Final = BOOT_VERSION.to_bytes(2, "big")
+_VERSION: Final = VERSION.to_bytes(2, "big")
 _REQUEST: Final = REQUEST.to_bytes(2, "big")
 _ANSWERS: Final = (ACK.to_bytes(2, "big"), NAK.to_bytes(2, "big"))
 _SHOWN: Final = 3
@@ -366,8 +368,11 @@ class PlanBus(SimulatedBus):
             word = None
         self._watch(frame, word, ends_at)
         takes_part = self.faults.takes_part
+        is_whole = True
         if self.frame_faults and word is not None:
-            for carried in self._disturbed(frame, word, sender, ends_at):
+            all_carried = self._disturbed(frame, word, sender, ends_at)
+            is_whole = frame in all_carried
+            for carried in all_carried:
                 self._carry(carried, senders, ends_at)
         else:
             self._carry(frame, senders, ends_at)
@@ -376,7 +381,7 @@ class PlanBus(SimulatedBus):
         if word == "host":
             if host is not None and sender is host.node:
                 host.echo(frame, ends_at)
-        elif takes_part and len(senders) == 1 and word is not None:
+        elif takes_part and is_whole and len(senders) == 1 and word is not None:
             self._hear(sender, frame.data, ends_at)
 
     def _hear(self, sender: Any, data: bytes, now: float) -> None:
@@ -385,7 +390,10 @@ class PlanBus(SimulatedBus):
         if data[:2] != _HEADER or word in (_GENERAL_FEEDBACK, _REQUEST):
             return
         if word == _BOOT_VERSION and self.awaits_burst:
-            self.awaits_burst, self.burst_ends_at = False, now + DEFAULT_TIMINGS.burst_s
+            # It may pass through its bootloader twice.
+            self.awaits_burst, self.burst_ends_at = False, now + DEFAULT_TIMINGS.announcing_on_s
+        elif word == _VERSION:  # its application is running
+            self.burst_ends_at = min(self.burst_ends_at, now)
         if word == _BOOT_VERSION and now <= self.burst_ends_at:
             return
         is_answer = word in _ANSWERS and not self.has_ended

@@ -47,17 +47,29 @@ def test_a_second_device_that_lost_its_application_needs_a_rescue(
     assert (verdict.ending, verdict.left) == (ending, "none / new")
 
 
-def test_a_restart_after_the_last_packet_looks_like_the_start_of_the_new_application() -> None:
+@each(
+    "line",
+    [
+        """
+        job ; independent {0} ; independent {0} ; @flash112+0.000756 hang seconds=1.230382
+        @end restart
+        """,
+        # Two restarts look like one device that passes through its bootloader twice.
+        """
+        job packets=300 image=980 ; mock reset_delay_s=0.447516 after_complete=restarts
+        mock version=V1r1r0_20230101 reset_delay_s=0.447516 after_complete=restarts
+        @packet10+0.049042 power seconds=3.328559
+        """,
+    ],
+)
+def test_a_restart_after_the_last_packet_looks_like_the_start_of_the_new_application(
+    line: str,
+) -> None:
     choices = (
         "restart=0.28644 window=0.674998 empty=listens erase=1.505184 bad_packet=nak_received"
         " older_packet=silent store=0.141036 start=0.306286 app_upgrade=silent"
     )
-    verdict = play(
-        Plan.parse(
-            f"job ; independent {choices} ; independent {choices}"
-            " ; @flash112+0.000756 hang seconds=1.230382 ; @end restart"
-        )
-    )
+    verdict = play(Plan.parse(line.format(choices)))
     assert [each.kind for each in verdict.violations] == ["UNSEEN"]
     assert (verdict.ending, verdict.left) == ("completed", "none / new")
 
