@@ -533,7 +533,8 @@ class Procedures:
         """Continue a session whose frames are not sent, because a device without power does not
         acknowledge any. Reports it if frames arrived since the last report, at `reported_at`
         frames; returns the number of received frames. Raises the error if the device still has an
-        application to lose, or if the overall deadline leaves no time.
+        application to lose, or if the overall deadline leaves no time; InterruptedByUserError if
+        the user cancels.
         """
         left_s = (session.deadline_at or inf) - self.clock.now()
         if not session.goes_on or left_s <= SEND_LIMIT_S + _REOPEN_PAUSE_S:
@@ -541,7 +542,13 @@ class Procedures:
         received = self.link.health().frames_received
         if received != reported_at:
             self._emit(events.BusBlocked(blocked.what, left_s))
-        self._wait_until(self.clock.now() + _REOPEN_PAUSE_S, _may_end(session))
+        if self._wait_until(self.clock.now() + _REOPEN_PAUSE_S, _may_end(session)):
+            raise InterruptedByUserError(
+                "Interrupted while no node acknowledged a frame.",
+                where=blocked.where,
+                cause=blocked.what,
+                remedy=f"Switch the device on. {AGAIN}",
+            ) from blocked
         return received
 
     def _await_adapter(self, session: UpgradeSession, lost: BusError, wait_s: float) -> None:

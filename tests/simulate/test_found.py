@@ -30,6 +30,13 @@ def test_ctrl_c_ends_the_wait_for_a_second_device() -> None:
     assert (verdict.ending, verdict.exit_code) == ("completed, interrupted", ExitCode.INTERRUPTED)
 
 
+def test_ctrl_c_ends_the_wait_for_a_device_without_power() -> None:
+    line = "job packets=5 others=false ; independent ; @packet2 power seconds=20 ; @4 interrupt"
+    verdict = play(Plan.parse(line))
+    assert (verdict.exit_code, verdict.violations) == (ExitCode.INTERRUPTED, ())
+    assert verdict.took_s < 8.0
+
+
 _TWO_DEVICES = "job packets=60 ; independent {0} ; independent answers=false {0}"
 
 
