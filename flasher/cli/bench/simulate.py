@@ -302,7 +302,8 @@ def _print_sum(total: Result, output: Output, *, is_shard: bool = False, subject
     if total.violation_count > len(total.violations):
         output.result(f"{total.violation_count:,} violations in all")
     if not total.runs:
-        output.result("NOTHING TRIED: no random plan was played; allow more time")
+        how = "allow more time, or make fewer parts" if is_shard else "allow more time"
+        output.result(f"NOTHING TRIED: no random plan was played; {how}")
     elif not total.violation_count:
         output.result(f"no violation in {counted(total.runs, 'run')}")
 

@@ -36,7 +36,11 @@ def say(line: str = "") -> None:
 
 
 def replay(line: str) -> int:
-    found = play(Story.parse(line), say)
+    try:
+        story = Story.parse(line)
+    except ValueError as error:
+        sys.exit(f"The story cannot be read: {error}.")
+    found = play(story, say)
     say()
     say(found.text or "no violation")
     return int(bool(found.kind))
