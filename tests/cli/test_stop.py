@@ -249,14 +249,19 @@ def test_a_signal_in_the_transfer_ends_it_cleanly_and_says_what_to_do(
     "options", [("--frame-gap", "0.08"), ("--packet-gap", "10"), ("--mock-speed", "0.1")]
 )
 def test_ctrl_c_ends_in_no_time_at_any_setting(tmp_path: Path, options: tuple[str, ...]) -> None:
-    """The end of a message is 1.4 s away at the slowest gap. A rescue transfers soonest."""
-    with flashing(tmp_path, *options, command="rescue") as process:
-        told(process)("transferring ...")
-        process.send_signal(signal.SIGINT)
-        began = time.perf_counter()
-        told(process)("cancelled by the user")
-        took_s = time.perf_counter() - began
-    assert took_s < 1.0  # 0.3 s, and room for a busy computer
+    """The end of a message is 1.4 s away at the slowest gap. A rescue transfers soonest. It takes
+    0.3 s; where other tests take the processor meanwhile, it is tried again.
+    """
+    for _ in range(3):
+        with flashing(tmp_path, *options, command="rescue") as process:
+            told(process)("transferring ...")
+            process.send_signal(signal.SIGINT)
+            began = time.perf_counter()
+            told(process)("cancelled by the user")
+            took_s = time.perf_counter() - began
+        if took_s < 1.0:
+            return
+    pytest.fail(f"it took {took_s:.1f} s at the third try, too")
 
 
 @signals_reach_processes
