@@ -104,7 +104,9 @@ class Runner(Generic[T]):
                 self._always[can_id] = self._listening[can_id] = self._reassembler(can_id)
 
     def _reassembler(self, can_id: int) -> Reassembler:
-        return Reassembler(can_id, self.timings.inter_frame_timeout_s)
+        """Return the one that may have received the first part of a message."""
+        known = self._listening.get(can_id)
+        return known or Reassembler(can_id, self.timings.inter_frame_timeout_s)
 
     def send(
         self,

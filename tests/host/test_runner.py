@@ -85,3 +85,21 @@ def test_what_is_heard_always_stays_when_something_else_is_listened_for() -> Non
             made.receive(Frame(can_id, part), 2.0)
     heard = [each.can_id for each in came if isinstance(each, Message)]
     assert heard == [0x720, 0x721, 0x730, 0x720]
+
+
+def test_a_message_under_way_is_received_by_the_next_stage() -> None:
+    came: list[StageInput] = []
+
+    def stage(run: Runner[Any]) -> Stage[None]:
+        run.listen_always(0x720)
+        yield 1.0
+        run.listen_always(0x720)
+        came.append((yield None))
+
+    made = Runner(stage, bitrate_bps=250_000)
+    made.tick(0.0)
+    made.receive(Frame(0x720, PARTS[0]), 1.0)
+    made.tick(1.0)
+    for part in PARTS[1:]:
+        made.receive(Frame(0x720, part), 1.0)
+    assert came == [Message(0x720, 0x0C, 0x1204, bytes((4, 0, 1, 0)))]

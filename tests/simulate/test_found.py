@@ -193,3 +193,10 @@ def test_a_second_tool_that_erased_the_device_in_a_pause_of_this_computer_is_see
         )
     )
     assert (verdict.ending, verdict.violations) == ("completed, second_tool", ())
+
+
+def test_a_boot_version_that_is_arriving_when_the_upgrade_begins_counts() -> None:
+    """Soon after it the reset is confirmed, so that an application is there as well (R27)."""
+    choices = "application=none drift=0.007 confirms_writes=true answers=false"
+    verdict = play(Plan.parse(f"job packets=3 gap=0.03 ; independent {choices}"))
+    assert verdict.violations == ()
