@@ -129,7 +129,10 @@ class SimulatedBus:
 
     @is_unacknowledged.setter
     def is_unacknowledged(self, alone: bool) -> None:
-        self.faults.isolate(self.clock.now(), alone=alone)
+        now = self.clock.now()
+        self.faults.isolate(now, alone=alone)
+        if not alone:  # what waited leaves from now on
+            self._sending_ends_at = max(self._sending_ends_at, now)
 
     def attach(self, engine: Engine, on_event: Callable[[object], None] | None = None) -> None:
         """Add a device; `on_event` is called with its events."""

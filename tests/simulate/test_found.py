@@ -160,6 +160,8 @@ def test_frames_that_a_killed_process_left_in_its_adapter_are_those_of_a_host() 
         """,
         # Another tool sends the same update command at the same time.
         "job packets=3 ; @0.2848 tool does=updates",
+        # Ctrl-C comes with a frame that waited in an adapter that was alone on the bus.
+        "job packets=3 others=false ; mock ; @frame75 interrupt ; @packet2 power seconds=7",
         # Two restarts of a device whose application answers no query: two bursts, then silence.
         """
         job packets=3 image=952 ; independent after_complete=restarts answers=false
