@@ -357,7 +357,9 @@ class PlanBus(SimulatedBus):
         self._sending = None
         if frame is None:
             return
-        sender, ends_at = senders[0], self._sending_ends_at
+        # Of equal frames in the same bits the host's adapter returns its own as an echo.
+        sender = next((each for each in senders if each in self._hosts), senders[0])
+        ends_at = self._sending_ends_at
         self._delivered_at = ends_at
         self.frames_carried += 1
         host = self.host

@@ -162,6 +162,11 @@ def test_frames_that_a_killed_process_left_in_its_adapter_are_those_of_a_host() 
         "job packets=3 ; @0.2848 tool does=updates",
         # Ctrl-C comes with a frame that waited in an adapter that was alone on the bus.
         "job packets=3 others=false ; mock ; @frame75 interrupt ; @packet2 power seconds=7",
+        # The second end of transfer is sent in the same bits as that of another tool.
+        """
+        job packets=3 short=64 ; independent store=0.000688
+        @packet3 unsolicited count=20 ; @end tool does=ends
+        """,
         # Two restarts of a device whose application answers no query: two bursts, then silence.
         """
         job packets=3 image=952 ; independent after_complete=restarts answers=false
