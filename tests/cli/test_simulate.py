@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import json
 import re
+import signal
 from contextlib import nullcontext
 from io import StringIO
 from pathlib import Path
@@ -170,6 +171,24 @@ def test_a_campaign_goes_on_where_its_ledger_ends(
     captured = capsys.readouterr()
     assert json.loads(captured.out.splitlines()[-1])["runs"] == 6
     assert "3 runs found in the ledger" in captured.err
+
+
+def test_the_page_of_a_stopped_campaign_says_so(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def run_batch(batch: Batch, *_: object) -> Result:
+        found = {batch.canary: 1} if batch.canary else {}
+        if not (batch.canary or batch.is_corpus):
+            signal.raise_signal(signal.SIGINT)
+        return Result(campaign_key(), runs=0 if found else batch.count, canaries_found=found)
+
+    monkeypatch.setattr(command, "run_batch", run_batch)
+    monkeypatch.setattr(command, "corpus_batch", lambda: part_of_corpus(0))
+    page = tmp_path / "page.html"
+    words = ["simulate", "--runs", "500", "--html", str(page)]
+    assert main(words) == ExitCode.INTERRUPTED
+    assert "STOPPED before its end" in page.read_text("utf-8")
+    assert ">failed<" in page.read_text("utf-8")
 
 
 def test_a_blind_campaign_fails(

@@ -230,9 +230,17 @@ def simulate(output: Output, chosen: Campaign) -> int:
     is_shard = chosen.shard is not None
     _print_sum(total, output, is_shard=is_shard, subject=subject)
     code = _exit_code(total, is_strict=chosen.strict, is_shard=is_shard)
-    _write_page(chosen.html, total, code, output, is_shard=is_shard, subject=subject)
     if was_stopped and code is ExitCode.OK:
         code = ExitCode.INTERRUPTED
+    _write_page(
+        chosen.html,
+        total,
+        code,
+        output,
+        is_shard=is_shard,
+        subject=subject,
+        missing=["STOPPED before its end"] if was_stopped else [],
+    )
     return output.document(total, exit_code=code)
 
 
