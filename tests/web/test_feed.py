@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flasher.station.board import Board
-from flasher.station.events import Progressed, StationEvent, StationStarted
+from flasher.station.events import Progressed, RunEnded, StationEvent, StationStarted
 from flasher.station.health import HealthWatch
 from flasher.station.shift_counts import ShiftCounts
 from flasher.web import feed as module
@@ -152,8 +152,13 @@ STARTED = StationStarted("line-2", "BAT-36", "4", "BAT-36", ("A", "B"), ())
 
 def at_the_line(event: Any) -> StationEvent:
     """The event, now and at a socket of this station."""
-    changes = {"socket": "AB"[len(event.socket) % 2]} if hasattr(event, "socket") else {}
-    return replace(event, at=datetime.now(UTC).isoformat(), **changes)  # type: ignore[no-any-return]
+    now = datetime.now(UTC)
+    changes: dict[str, Any] = {}
+    if hasattr(event, "socket"):
+        changes = {"socket": "AB"[len(event.socket) % 2]}
+    if isinstance(event, RunEnded):
+        changes = {"run": replace(event.run, begun_at=now, ended_at=now, **changes)}
+    return replace(event, at=now.isoformat(), **changes)  # type: ignore[no-any-return]
 
 
 OTHERS = [each for each in get_args(StationEvent) if each is not StationStarted]
