@@ -533,8 +533,7 @@ class Procedures:
         """Continue a session whose frames are not sent, because a device without power does not
         acknowledge any. Reports it if frames arrived since the last report, at `reported_at`
         frames; returns the number of received frames. Raises the error if the device still has an
-        application to lose, or if the overall deadline leaves no time; InterruptedByUserError if
-        the user cancels.
+        application to lose, or if the overall deadline leaves no time.
         """
         left_s = (session.deadline_at or inf) - self.clock.now()
         if not session.goes_on or left_s <= SEND_LIMIT_S + _REOPEN_PAUSE_S:
@@ -542,13 +541,7 @@ class Procedures:
         received = self.link.health().frames_received
         if received != reported_at:
             self._emit(events.BusBlocked(blocked.what, left_s))
-        if self._wait_until(self.clock.now() + _REOPEN_PAUSE_S, _may_end(session)):
-            raise InterruptedByUserError(
-                "Interrupted while no node acknowledged a frame.",
-                where=blocked.where,
-                cause=blocked.what,
-                remedy=f"Switch the device on. {AGAIN}",
-            ) from blocked
+        self._wait_until(self.clock.now() + _REOPEN_PAUSE_S, _may_end(session))
         return received
 
     def _await_adapter(self, session: UpgradeSession, lost: BusError, wait_s: float) -> None:

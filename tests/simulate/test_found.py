@@ -118,6 +118,11 @@ def test_frames_that_a_killed_process_left_in_its_adapter_are_those_of_a_host() 
         """,
         # A line doubles a boot version.
         "job target=obc ; independent begins=boot ; @update answer becomes=twice",
+        # Frames that waited for a device's power leave when it is back, not before.
+        """
+        job packets=5 others=false ; independent erase=3.598112 store=0.000289
+        @frame75 interrupt ; @packet2 power seconds=7.357221
+        """,
         # An update command with gaps takes longer than the device listens.
         """
         job packets=10 gap=0.056 ; adapter echoes=true delay=0.000477 jitter=0.005232 seed=60055551
