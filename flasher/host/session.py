@@ -6,7 +6,6 @@ the same code. A guard watches the bus during all stages.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from math import inf
@@ -293,9 +292,10 @@ class UpgradeSession(Runner[Result]):
     def _verified(self) -> Stage[Verification]:
         level, self._checking = self._level, Level.NONE
         self.listen_always(self._plan.target.answer_id)
-        was_cancelled = False
-        with contextlib.suppress(SecondToolSeen):  # the device has the image anyway
+        try:
             was_cancelled = yield from self.await_second_device()
+        except SecondToolSeen as tool:
+            return Verification(level, Verdict.SECOND_TOOL, None, tool.description)
         if self.duplicates.evidence:
             return Verification(level, Verdict.TWO_DEVICES, None, self.duplicates.evidence)
         found = NOT_ASKED

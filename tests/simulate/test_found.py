@@ -196,14 +196,23 @@ def test_a_device_that_restarts_in_time_is_upgraded(line: str) -> None:
     assert (verdict.ending, verdict.violations) == ("completed", ())
 
 
-def test_a_second_tool_that_erased_the_device_in_a_pause_of_this_computer_is_seen() -> None:
-    verdict = play(
-        Plan.parse(
-            "job packets=3 ; mock reset_delay_s=0.413 start_delay_s=0.011 erase_time_s=0.0007"
-            " ; @end+0.05 stall ; @end+0.1 tool does=resets ; @end+0.5 tool does=packets"
-            " ; @end+0.6 tool does=updates"
-        )
-    )
+@each(
+    "line",
+    [
+        """
+        job packets=3 ; mock reset_delay_s=0.413 start_delay_s=0.011 erase_time_s=0.0007
+        @end+0.05 stall ; @end+0.1 tool does=resets ; @end+0.5 tool does=packets
+        @end+0.6 tool does=updates
+        """,
+        # This target has no version query.
+        """
+        job target=obc packets=8 ; mock ; @end+0.000118 stall seconds=1.8
+        @end+0.05 tool does=packets ; @end+0.3 tool does=updates
+        """,
+    ],
+)
+def test_a_second_tool_that_wrote_in_a_pause_of_this_computer_is_seen(line: str) -> None:
+    verdict = play(Plan.parse(line))
     assert (verdict.ending, verdict.violations) == ("completed, second_tool", ())
 
 
