@@ -22,6 +22,7 @@ from flasher.simulate import plan as plans
 from flasher.simulate.independent import (
     ACK,
     BOOT_VERSION,
+    COMPLETE,
     FEEDBACK,
     NAK,
     REPORT,
@@ -42,6 +43,7 @@ _ROUNDING_S: Final = 1e-9
 _HEADER, _GENERAL_FEEDBACK = b"\x55\xaa", FEEDBACK.to_bytes(2, "big")
 _BOOT_VERSION: Final = BOOT_VERSION.to_bytes(2, "big")
 _VERSION: Final = VERSION.to_bytes(2, "big")
+_COMPLETE: Final = COMPLETE.to_bytes(2, "big")
 _REQUEST: Final = REQUEST.to_bytes(2, "big")
 _ANSWERS: Final = (ACK.to_bytes(2, "big"), NAK.to_bytes(2, "big"))
 _SHOWN: Final = 3
@@ -339,8 +341,8 @@ class PlanBus(SimulatedBus):
         feedback does not count: an application sends it to all that is not for it. Nor does a
         request for the transfer: one device may repeat it (R16).
         """
-        self.has_ended = False
-        """End of transfer was sent; set by the player."""
+        self._is_complete = False
+        """A device reported completion: whoever answers after it is another one."""
         self.burst_ends_at = inf
         """Time up to which boot versions do not count either; set by the player. One device may
         continue its burst after the update command, or begin it anew.
@@ -398,7 +400,8 @@ class PlanBus(SimulatedBus):
             self.burst_ends_at = min(self.burst_ends_at, now)
         if word == _BOOT_VERSION and now <= self.burst_ends_at:
             return
-        is_answer = word in _ANSWERS and not self.has_ended
+        is_answer = word in _ANSWERS and not self._is_complete
+        self._is_complete |= word == _COMPLETE
         self._alone[sender.engine] += 1 if is_answer else _SHOWN
 
     @property
@@ -409,7 +412,7 @@ class PlanBus(SimulatedBus):
     def forget_heard(self) -> None:
         """Begin with another transfer."""
         self._alone.clear()
-        self.has_ended = False
+        self._is_complete = False
 
     def _carry(self, frame: Frame, senders: Sequence[Any], now: float) -> None:
         if not frame.is_error:

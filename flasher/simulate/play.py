@@ -300,7 +300,7 @@ class Player:
                     self.bus.forget_heard()
                     self.bus.burst_ends_at, self.bus.awaits_burst = inf, False
                 elif what == "end" and not self._facts.rules.ends:
-                    self.bus.awaits_burst = self.bus.has_ended = True
+                    self.bus.awaits_burst = True
                 elif what == "packet":
                     ends_at = now + DEFAULT_TIMINGS.leftover_boot_version_s
                     self.bus.burst_ends_at = min(self.bus.burst_ends_at, ends_at)
