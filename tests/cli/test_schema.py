@@ -285,6 +285,8 @@ def sample(hint: Any) -> Any:
         return list(hint)[-1]
     if get_origin(hint) is tuple:
         return (sample(get_args(hint)[0]),) * 2
+    if type(None) in get_args(hint):
+        return sample(get_args(hint)[0])
     if is_dataclass(hint):
         return make(hint)
     if hint is object:
