@@ -241,8 +241,8 @@ class Line:
         match event["event"]:
             case "SocketChanged":
                 self._states[event["socket"]] = event["state"], event["serial"]
-            case "RunEnded" if event["outcome"] == "pass":
-                self._hold(event["socket"], event["serial"])
+            case "RunEnded" if event["run"]["state"] == "pass":
+                self._hold(event["run"]["socket"], event["run"]["serial"])
 
     def _hold(self, socket: str, serial: str) -> None:
         """A PASS is shown: the unit with this label has to be what it says, and in that socket."""
@@ -336,12 +336,18 @@ class Line:
         return not any(state in ("running", "saving") for state, _ in self._states.values())
 
     def _ending(self, label: str) -> str:
-        of_label = [each for each in self._shown if label in (each.get("serial"), each.get("text"))]
+        of_label = [
+            each
+            for each in self._shown
+            if label in (each.get("run", each).get("serial"), each.get("text"))
+        ]
         said = [each for each in of_label if each["event"] in ("RunEnded", "ScanRefused")]
         if not said:
             return "nothing"
         last = said[-1]
-        return str(last["code"]) if last["event"] == "RunEnded" else f"refused {last['code']}"
+        return (
+            str(last["run"]["code"]) if last["event"] == "RunEnded" else f"refused {last['code']}"
+        )
 
     def _clear(self, sockets: Sequence[str]) -> None:
         self._pump(_GONE_S)

@@ -210,20 +210,18 @@ class Campaign:
         self.problems += [each for each in found if each not in self.problems]
         runs = {run["run_id"]: run for run in said["report"]["runs"]}
         for event in self.operator.shown:
-            run = runs.get(event["run_id"])
-            if run is None or run["serial"] != event["serial"]:
+            shown = event.get("run", event)  # the whole run in RunEnded
+            run = runs.get(shown["run_id"])
+            if run is None or run["serial"] != shown["serial"]:
                 self._wrong(Fault.LOST, str(event))
-            elif event["event"] == "RunEnded" and (run["state"], run["code"]) != (
-                event["outcome"],
-                event["code"],
-            ):
-                self._wrong(Fault.LOST, f"{event}, saved {run['state']} {run['code']}")
+            elif shown is not event and run != shown:
+                self._wrong(Fault.LOST, f"{event}, saved {run}")
         for what in [each for each in self.counts if each.startswith("saved ")]:
             del self.counts[what]
         states = [run["state"] for run in runs.values()]
         for state in set(states):
             self.counts[f"saved {state}"] = states.count(state)
-        passes = sum(event.get("outcome") == "pass" for event in self.operator.shown)
+        passes = sum(event.get("run", {}).get("state") == "pass" for event in self.operator.shown)
         self.counts["saved pass, the kill was before it was shown"] = states.count("pass") - passes
 
     def _ask(self, action: str) -> dict[str, list[dict[str, str]]]:

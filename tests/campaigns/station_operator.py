@@ -302,7 +302,7 @@ class Operator:
                 run = event["run"]
                 self.counts[f"shown {run['state']} {run['code']}"] += 1
                 if run["state"] == "pass":
-                    self._hold(event["serial"], place)
+                    self._hold(run["serial"], place)
             case "OperatorPrompted" if place.unit:
                 self.counts["power cycles"] += 1
                 self.units.out(place.unit)

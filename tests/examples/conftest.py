@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from tests.cli.conftest import bundle_folder, flasher
+from tests.cli.conftest import bundle_folder, flasher, folders
 
-__all__ = ["bundle_folder", "flasher"]
+__all__ = ["bundle_folder", "flasher", "folders"]

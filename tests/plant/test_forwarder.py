@@ -318,7 +318,8 @@ def test_two_copies_of_the_records_that_both_go_on_are_a_fork(
     sender.bench.store.recover()
     sender.start()
     assert refused(sender) is Refusal.REPLAYED
-    sender.bench.make(serial="W2605009")
+    for serial in ("W2605009", "W2605010"):
+        sender.bench.make(serial=serial)
     assert refused(sender) is Refusal.FORKED
 
 

@@ -77,7 +77,7 @@ from flasher import api
 from flasher.protocol.spec import BMS
 from flasher.settings.profile import load_profile
 api.prepare(sys.argv[1], load_profile(os.devnull, BMS)).checked()
-wanted = {"flasher.release.verify", "securesystemslib", "cryptography", "zipfile"}
+wanted = {"flasher.release.verify", "securesystemslib", "cryptography"}
 sys.exit(repr(wanted & sys.modules.keys()) if wanted & sys.modules.keys() else 0)
 """
 
