@@ -34,6 +34,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from flasher.errors import printable
 from flasher.settings.bike_set import TargetImage, TargetTable, check_named_once
 from flasher.settings.toml_reader import Reader, TomlTable
 from flasher.station.pattern import CHECKS, TEXT_MAX, pattern_of
@@ -375,6 +376,7 @@ def _part(part: re.Match[str], scan: Scan) -> str:
     if name == "date":
         form = form or DATE_DEFAULT
         if _DATE_FORM.fullmatch(form) is None:
+            word = printable(word)
             raise ValueError(f"{{{word}}} is not a date: use %Y %y %m %d %j %G %V %u")
         return scan.day.strftime(form)
     if word == "serial":
@@ -383,5 +385,6 @@ def _part(part: re.Match[str], scan: Scan) -> str:
         return scan.lot
     if word.startswith(_GROUP) and word.removeprefix(_GROUP) in scan.groups:
         return scan.groups[word.removeprefix(_GROUP)]
+    word = printable(word)
     known = ["{serial}", "{lot}", "{date:%Y%m%d}", *(f"{{match.{g}}}" for g in scan.groups)]
     raise ValueError(f"unknown placeholder {{{word}}}; known are {', '.join(known)}")

@@ -75,6 +75,10 @@ def test_a_good_recipe_is_read_with_its_images(tmp_path: Path) -> None:
         (lambda t: t + target_table(BMS), "a target is named twice"),
         (lambda t: t + "verify = 'memory'\n", "only with its base"),
         (lambda t: t + SERIAL_WRITE.replace("{serial}", "{seral}"), "unknown placeholder {seral}"),
+        (
+            lambda t: t + SERIAL_WRITE.replace("{serial}", "{\\tserial}"),
+            "unknown placeholder {\\tserial}",
+        ),
         (lambda t: t + SERIAL_WRITE.replace("{serial}", "{serial}" * 3), "longer than 15"),
         (lambda t: t + SERIAL_WRITE.replace("manufacturer = true", ""), "for the manufacturer"),
         (lambda t: t + SERIAL_WRITE.replace("serial-", "seral-"), "Did you mean serial-number"),
