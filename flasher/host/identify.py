@@ -65,7 +65,7 @@ class IdentifyStage:
         item = self._version_item
         run.listen_always(self._answer_id, *(() if item is None else (item.can_id,)))
         run.emit(PhaseEntered(Phase.LISTEN, 1))
-        yield from self._listen(run.now + LISTEN_FIRST_S)
+        yield from run.listen_for(LISTEN_FIRST_S, self._look)
         if self.cancelled:
             return self
         self.phase = Phase.IDENTIFY
@@ -82,13 +82,6 @@ class IdentifyStage:
         for request in self._requests:
             if self.announcement is None:
                 yield request
-
-    def _listen(self, until: float) -> Stage[None]:
-        came: StageInput | None = None
-        # After a pause of this computer, `TIME` follows all that was received meanwhile.
-        while came is not Signal.TIME and not self.cancelled:
-            came = yield until
-            self._look(came)
 
     def _look(self, came: StageInput) -> StageInput:
         """Process an input of a query; a boot version cancels the query."""

@@ -104,7 +104,7 @@ class Runner(Generic[T]):
                 self._always[can_id] = self._listening[can_id] = self._reassembler(can_id)
 
     def _reassembler(self, can_id: int) -> Reassembler:
-        """Return the one that may have received the first part of a message."""
+        """Return that of this CAN id, which may hold the first part of a message, or a new one."""
         known = self._listening.get(can_id)
         return known or Reassembler(can_id, self.timings.inter_frame_timeout_s)
 
@@ -127,14 +127,23 @@ class Runner(Generic[T]):
         """Report damaged bytes as an event."""
         self._events.append(BytesDamaged(damage.can_id, damage.reason.value, damage.data))
 
-    def await_second_device(self) -> Stage[bool]:
-        """Wait for late answers of a second device; return True if cancelled."""
-        until = self.now + SECOND_DEVICE_WAIT_S
+    def listen_for(
+        self, seconds: float, look: Callable[[StageInput], object] | None = None
+    ) -> Stage[bool]:
+        """Wait, and call `look` with each input; return True if cancelled. After a pause of this
+        computer all that was received meanwhile comes before the end.
+        """
+        until = self.now + seconds
         came: StageInput | None = None
-        # After a pause of this computer, `TIME` follows all that was received meanwhile.
         while came not in (Signal.TIME, Signal.CANCEL):
             came = yield until
+            if look is not None:
+                look(came)
         return came is Signal.CANCEL
+
+    def await_second_device(self) -> Stage[bool]:
+        """Wait for late answers of a second device; return True if cancelled."""
+        return self.listen_for(SECOND_DEVICE_WAIT_S)
 
     def finish_message(self) -> Stage[None]:
         """Send the rest of a partly sent message, unless the adapter accepts no more frames."""

@@ -103,14 +103,9 @@ class Survey(Runner[None]):
     def _listen_and_ask(
         self, run: Runner[None], listen_s: float, requests: Iterable[Request]
     ) -> Stage[None]:
-        until = run.now + listen_s
-        came: StageInput | None = None
-        while came is not Signal.TIME:
-            came = yield until
-            self._take(came)
-            if came is Signal.CANCEL:
-                self.cancelled = True
-                return
+        self.cancelled = yield from run.listen_for(listen_s, self._take)
+        if self.cancelled:
+            return
         self.other_tool_heard = Node.CDL in self.heard
         if not self.other_tool_heard:
             asking = ask_all(run, self._while_answered(requests), self.queries)
