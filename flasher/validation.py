@@ -56,6 +56,14 @@ class NumberRange:
     gt: float | None = None
     le: float | None = None
 
+    def allows(self, value: float) -> bool:
+        """Return True for a number within the limits."""
+        return (
+            (self.ge is None or value >= self.ge)
+            and (self.gt is None or value > self.gt)
+            and (self.le is None or value <= self.le)
+        )
+
     def __get_pydantic_core_schema__(
         self, source: Any, handler: Callable[[Any], CoreSchema]
     ) -> CoreSchema:

@@ -29,17 +29,18 @@ from flasher.bus.simulated import DEFAULT_QUEUE_FRAMES
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import PACKET_COUNT_MAX, PACKET_DATA_SIZE
 from flasher.simulate.independent import Choices
+from flasher.validation import NumberRange
 
 TEXT_MAX_SIZE: Final = 1_000_000
-_LIMITS: Final[dict[object, tuple[float, float]]] = {
-    int: (0, 0xFFFF),
-    float: (0, 3600),
+_LIMITS: Final[dict[object, NumberRange]] = {
+    int: NumberRange(ge=0, le=0xFFFF),
+    float: NumberRange(ge=0, le=3600),
 }
 """Of numbers without another annotation; most floats are seconds."""
-Count = Annotated[int, (1, 1000)]
-Interval = Annotated[float, (0.0001, 3600)]
-Share = Annotated[float, (0, 1)]
-Seed = Annotated[int, (0, math.inf)]
+Count = Annotated[int, NumberRange(ge=1, le=1000)]
+Interval = Annotated[float, NumberRange(ge=0.0001, le=3600)]
+Share = Annotated[float, NumberRange(ge=0, le=1)]
+Seed = Annotated[int, NumberRange(ge=0)]
 Sender = Literal["any", "host", "device"]
 _NUMBERED: Final = ("packet", "frame", "flash")
 _SECONDS: Final = r"\d+(?:\.\d+)?(?:e[+-]?\d+)?"
@@ -101,8 +102,8 @@ class Job(Clause):
 
     NAME = "job"
     target: Literal["bms", "wmc", "obc"] = "bms"
-    packets: Annotated[int, (1, PACKET_COUNT_MAX)] = 20
-    short: Annotated[int, (0, PACKET_DATA_SIZE - 1)] = 5
+    packets: Annotated[int, NumberRange(ge=1, le=PACKET_COUNT_MAX)] = 20
+    short: Annotated[int, NumberRange(ge=0, le=PACKET_DATA_SIZE - 1)] = 5
     """Bytes that the last packet is short of a whole one."""
     image: int = 5
     """Seed of the image's bytes."""
@@ -143,7 +144,7 @@ class Device(Clause):
     """Version of the old application."""
     begins: Literal["application", "boot", "off"] = "application"
     """`boot`: it is switched on at the beginning."""
-    drift: Annotated[float, (-0.5, 0.5)] = 0.0
+    drift: Annotated[float, NumberRange(ge=-0.5, le=0.5)] = 0.0
     """Its clock is faster by this share."""
     choices: str = ""
     """What else a kind of device can choose."""
@@ -183,7 +184,7 @@ class Load(Clause):
     """Other traffic, one frame every so many seconds; id 0 wins every arbitration."""
 
     NAME = "load"
-    id: Annotated[int, (0, 0x7FF)] = 0x712
+    id: Annotated[int, NumberRange(ge=0, le=0x7FF)] = 0x712
     every: Interval = 0.002
     seconds: float = 3600.0
 
@@ -235,7 +236,7 @@ class Flip(OnFrames):
     """One bit is wrong, and the checksum of the CAN frame does not detect it."""
 
     NAME = "flip"
-    bit: Annotated[int, (0, 63)] = 0
+    bit: Annotated[int, NumberRange(ge=0, le=63)] = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -243,7 +244,7 @@ class Truncate(OnFrames):
     """Only its first `to` bytes arrive."""
 
     NAME = "truncate"
-    to: Annotated[int, (0, 8)] = 3
+    to: Annotated[int, NumberRange(ge=0, le=8)] = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -289,7 +290,7 @@ class Answer(OnDevice):
     becomes: Literal["same", "ack", "nak", "silence", "twice"] = "same"
     """An ACK becomes a NAK of the same number, and the reverse; `twice`: it is sent twice, unless
     it is general feedback."""
-    shift: Annotated[int, (-0xFFFF, 0xFFFF)] = 0
+    shift: Annotated[int, NumberRange(ge=-0xFFFF, le=0xFFFF)] = 0
     """Added to the number of an ACK or NAK."""
     late: float = 0.0
     """Seconds."""
@@ -504,7 +505,8 @@ def _values(kind: type, words: Sequence[str]) -> dict[str, Any]:
             raise ValueError(f"{kind.__name__} has no {name[:40]!r}")
         limits = _LIMITS.get(hint)
         if get_origin(hint) is Annotated:
-            hint, limits = get_args(hint)[:2]
+            hint, *others = get_args(hint)
+            limits = next((each for each in others if isinstance(each, NumberRange)), None)
         if get_origin(hint) is Literal:
             if text not in get_args(hint):
                 raise ValueError(f"{word[:40]!r}: it is one of {', '.join(get_args(hint))}")
@@ -520,13 +522,15 @@ def _values(kind: type, words: Sequence[str]) -> dict[str, Any]:
     return values
 
 
-def _number(word: str, text: str, kind: type, limits: object) -> float:
+def _number(word: str, text: str, kind: type, limits: NumberRange | None) -> float:
     try:
         value: float = int(text, 0) if kind is int else float(text)
     except ValueError as error:
         raise ValueError(f"{word[:40]!r}: it is not a number") from error
     if kind is float and not math.isfinite(value):
         raise ValueError(f"{word[:40]!r}: it is not finite")
-    if isinstance(limits, tuple) and not limits[0] <= value <= limits[1]:
-        raise ValueError(f"{word[:40]!r}: it is from {limits[0]:g} to {limits[1]:g}")
+    if limits is not None and not limits.allows(value):
+        raise ValueError(
+            f"{word[:40]!r}: it is from {limits.ge or 0:g} to {limits.le or math.inf:g}"
+        )
     return value
