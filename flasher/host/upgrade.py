@@ -8,7 +8,7 @@ and sends the next message. A timer starts when a message was sent.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf
 from typing import Any, Final
 
@@ -46,6 +46,7 @@ from flasher.protocol.messages import (
 )
 from flasher.protocol.spec import Command, Mode
 from flasher.protocol.text import boot_version_number, printable
+from flasher.protocol.timing import Announcing
 from flasher.protocol.wire import Damage, Message, encode, split
 
 ReceivedContent = UpgradeMessage | Malformed | Unknown | Content | None
@@ -128,9 +129,8 @@ class _Attempt:
     end_tries: int = 0
     end_copies_left: int = 0
     end_naks: int = 0
-    announced_at: float | None = None
-    """Time of the first of the consecutive boot versions since end of transfer."""
-    announced_last_at: float = 0.0
+    announcing: Announcing = field(default_factory=Announcing)
+    """Consecutive boot versions since end of transfer."""
     running_version: str | None = None
     unobserved_s: float = 0.0
     """Time since the update command in which the adapter was away."""
@@ -474,7 +474,7 @@ class UpgradeStage:
                 if self._at.announced_meanwhile is not None:
                     return timings.update_spacing_s
                 return timings.request_transfer_timeout_s
-            case Command.END_OF_TRANSFER, UpgradeState.ENDING if self._at.announced_at is None:
+            case Command.END_OF_TRANSFER, UpgradeState.ENDING if not self._at.announcing.has_begun:
                 return timings.complete_timeout_s
             case (Command.RESET, UpgradeState.RESETTING) | (
                 Command.READ_VERSION,
@@ -869,7 +869,7 @@ class UpgradeStage:
         if at.end_copies_left <= at.end_naks:
             return  # answers a packet
         at.end_naks += 1
-        at.announced_at = None  # it still waits in its transfer
+        at.announcing.forget()  # it still waits in its transfer
         if at.end_naks > 1:
             self._end(Ending.REFUSED, nak)
             return
@@ -886,7 +886,7 @@ class UpgradeStage:
         self._repeat_end(Reason.LINK_BACK)
 
     def _miss_end(self, row: ReceivedContent) -> None:
-        is_announcing = self._at.announced_at is not None
+        is_announcing = self._at.announcing.has_begun
         self._timeouts += not is_announcing
         if not is_announcing and self._at.end_tries < self._timings.end_tries:
             self._repeat_end(Reason.END_UNANSWERED)
@@ -912,10 +912,10 @@ class UpgradeStage:
             # It announces itself before it can have received the end.
             self._restarted(boot, Reason.RESTARTED)
             return
-        if at.announced_at is None or now - at.announced_last_at > self._timings.burst_s:
-            at.announced_at = now
-        at.announced_last_at = now
-        if now - at.announced_at >= self._timings.announcing_on_s:
+        if now - at.announcing.last_at > self._timings.burst_s:
+            at.announcing.forget()
+        at.announcing.note(now)
+        if at.announcing.lasted_s >= self._timings.announcing_on_s:
             self._run.listen()
             self._restarted(boot, Reason.RESTARTED)
         elif self.state is UpgradeState.ENDING:

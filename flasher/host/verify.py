@@ -280,13 +280,13 @@ def check_version(run: Runner[Any], plan: Plan, options: UpgradeOptions) -> Stag
     while True:
         query = yield from filtered(ask(run, Query(request, quiet=True)), look)
         if query.answer is not None:
-            answered_at = run.now
+            announced = announcing.count
             if not run.is_cancelled:
                 again = yield from filtered(ask(run, Query(request, quiet=True)), look)
                 yield from filtered(count_answers(run, [again]), look)
             # A device that restarted answers again; the bootloader of a second one goes on.
-            is_settled = announcing.last_at <= answered_at or run.is_cancelled
-            if is_settled or run.duplicates.evidence:
+            is_settled = announcing.count == announced
+            if is_settled or run.is_cancelled or run.duplicates.evidence:
                 break
         if run.is_cancelled:
             return Verification(Level.VERSION, Verdict.INTERRUPTED)

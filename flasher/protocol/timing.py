@@ -81,17 +81,24 @@ class Announcing:
     first_at: float = inf
     last_at: float = -inf
     """Times of the first and last boot version, in seconds."""
+    count: int = 0
+    """Number of boot versions, also of those forgotten."""
     _longest_pause_s: float = 0.0
 
     def note(self, now: float) -> None:
         """Record a boot version."""
-        if self.first_at < inf:
+        if self.has_begun:
             self._longest_pause_s = max(self._longest_pause_s, now - self.last_at)
         self.first_at, self.last_at = min(self.first_at, now), now
+        self.count += 1
 
     def forget(self) -> None:
         """Begin anew."""
         self.first_at, self.last_at, self._longest_pause_s = inf, -inf, 0.0
+
+    @property
+    def has_begun(self) -> bool:
+        return self.first_at < inf
 
     @property
     def lasted_s(self) -> float:
@@ -101,7 +108,7 @@ class Announcing:
     @property
     def judged_at(self) -> float:
         """Time at which those that have begun have ended or go on; -inf without any."""
-        if self.first_at == inf:
+        if not self.has_begun:
             return -inf
         return self.first_at + self.timings.announcing_on_s + 2 * self.timings.burst_s
 

@@ -425,6 +425,18 @@ def test_a_device_that_restarts_after_its_version_answer_is_asked_again(
     assert (check.result.verdict, check.result.running_version) == (verdict, version)
 
 
+def test_a_boot_version_read_at_the_same_moment_as_the_answer_before_it_counts() -> None:
+    check = version_check(planned(), UpgradeOptions())
+    application = Application(check)
+    application.next_question()
+    application.answer(VERSION, NEW_VERSION)
+    for piece in ANNOUNCEMENT:
+        check.receive(piece, application.now)
+    assert application.next_question() is not None, "its answers are counted"
+    application.answer(VERSION, NEW_VERSION)
+    assert application.next_question() is not None, "it is asked again"
+
+
 def test_all_that_came_in_a_pause_of_this_computer_is_read_before_the_verdict() -> None:
     check = version_check(planned(), UpgradeOptions())
     application = Application(check)
