@@ -71,7 +71,12 @@ def passed_twice(connection: Connection, limit: int) -> list[PassedTwice]:
     wanted = {run_id for pair in pairs for run_id in pair}
     found = runs_of(connection, RUN_QUERY.where(run.c.id.in_(wanted)), released_runs(connection))
     runs: dict[int, RunRecord] = {each.run_id: each for each in found}
-    return [PassedTwice(runs[first], runs[second]) for first, second in pairs]
+    # `verify` reports runs that are missing, or refer to missing rows.
+    return [
+        PassedTwice(runs[first], runs[second])
+        for first, second in pairs
+        if {first, second} <= runs.keys()
+    ]
 
 
 class PlantFiles(FileStore):

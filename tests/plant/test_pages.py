@@ -166,6 +166,11 @@ def test_units_that_passed_at_two_stations_are_shown_with_their_marks(
         assert runs.count("<small>duplicates not checked</small>") == 2  # table and list
         unit = page(pages, "/units", serial=SERIAL, part="BAT-36")
         assert "not checked: the server was away" in unit
+    with plant.connect() as owner:
+        owner.execute("SET session_replication_role = replica")
+        owner.execute("DELETE FROM run WHERE id = %s", [found.first.run_id])
+    with closing(opened(plant)) as store:
+        assert store.passed_twice(100) == [], "verify reports that a run is missing"
 
 
 def test_each_page_shows_the_units_of_all_stations(plant: Plant, sender: Sender) -> None:
