@@ -145,6 +145,13 @@ def test_a_code_that_repeats(sockets: list[SocketRuns], state: CheckState) -> No
     assert state_of(CheckKind.REPEATED, activity=replace(BUSY, sockets=tuple(sockets))) is state
 
 
+def test_times_are_in_utc_in_whatever_time_zone_the_server_is(plant: Plant) -> None:
+    with plant.connect() as owner:
+        owner.execute(f"ALTER DATABASE {plant.database} SET timezone = 'Asia/Shanghai'".encode())
+        owner.execute("UPDATE plant_station SET reported_at = '2026-05-17 12:00Z'")
+    assert as_json(plant.status())["reported_at"] == "2026-05-17T12:00:00Z"
+
+
 def test_yield_and_last_runs_are_those_of_each_station(plant: Plant, sender: Sender) -> None:
     """The bench begins at 9:00; the shift at 10:00."""
     other = plant.sender("line-3")

@@ -59,12 +59,13 @@ class _Connection(psycopg.Connection[Any]):
 
 
 def make_engine(url: URL, lock_timeout_s: float, statement_limit_s: float | None = None) -> Engine:
-    """Create the engine of a server. Limits in the URL take precedence."""
+    """Create the engine of a server. Settings in the URL take precedence."""
     work_s = STATEMENT_LIMIT_S if statement_limit_s is None else statement_limit_s
     silence_s = SILENCE_LIMIT_S if statement_limit_s is None else statement_limit_s + 5.0
-    limits = {
+    settings = {
         # It compiles what it plans as long, for longer than these queries then take.
         "jit": "off",
+        "timezone": "UTC",
         "lock_timeout": round(lock_timeout_s * 1000),
         "statement_timeout": round((lock_timeout_s + work_s) * 1000),
         **{f"tcp_{name}": value for name, value in _PROBES.items()},
@@ -80,7 +81,7 @@ def make_engine(url: URL, lock_timeout_s: float, statement_limit_s: float | None
 
     @event.listens_for(engine, "do_connect")
     def connect(_dialect: Any, _record: Any, _args: Any, wanted: dict[str, Any]) -> Any:
-        options = " ".join(f"-c {name}={value}" for name, value in limits.items())
+        options = " ".join(f"-c {name}={value}" for name, value in settings.items())
         options = f"{options} {wanted.get('options', '')}".rstrip()
         made = _Connection.connect(**(usual | wanted | {"options": options}))
         made.silence_limit_s = lock_timeout_s + silence_s
