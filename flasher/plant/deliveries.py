@@ -18,7 +18,7 @@ from flasher.plant.claim_list import released_runs
 from flasher.plant.queue import TASK
 from flasher.protocol.text import printable
 from flasher.station.records.errors import NotFoundError
-from flasher.station.records.model import RELEASED_MARK, RunDetails
+from flasher.station.records.model import RunDetails
 from flasher.station.records.queries import details_of
 from flasher.station.records.schema import run
 from flasher.validation import json_keys
@@ -255,8 +255,6 @@ def document_of(connection: Connection, station: UUID, number: int) -> RunDocume
     key = key_of(station, number)
     run_id = connection.execute(_RUN_OF, {"station": station, "number": number}).scalar()
     for details in details_of(connection, run.c.id == run_id):
-        ended = details.run
-        if run_id in released_runs(connection):
-            ended = replace(ended, duplicates=RELEASED_MARK)
+        ended = details.run.marked(released_runs(connection))
         return RunDocument(key, station, number, replace(details, run=ended))
     raise NotFoundError(f"There is no run with the key {key}.")

@@ -41,7 +41,6 @@ from flasher.station.records.capability import VALUES_MIN
 from flasher.station.records.errors import NotFoundError, RecordError, UnprovenError
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import (
-    RELEASED_MARK,
     TORN_TRACE,
     TRACE,
     AttachmentFile,
@@ -163,10 +162,6 @@ class SupervisorPages:
     def _trouble(self, question: Question, status: int, error: FlasherError) -> Answer:
         return self._page(question, "trouble.html", http=status, error=error, path="")
 
-    def released(self) -> Mapping[int, str]:
-        """Marks of runs that reached the plant after the claim of their unit was released."""
-        return dict.fromkeys(self.store.read.released(), RELEASED_MARK)
-
     def _page(
         self, question: Question, template: str, *, http: int = 200, **context: Any
     ) -> Answer:
@@ -186,7 +181,7 @@ class SupervisorPages:
             page=page,
             codes=list(codes.CODES),
             **self._choices(),
-            released=self.released(),
+            released=self.store.read.released(),
             passed_twice=self.store.passed_twice(_TWICE_MAX),
             warning=Status.WARNING,
         )
@@ -195,12 +190,8 @@ class SupervisorPages:
         media_type, make = _FILES[question.path]
         if make is Report.to_csv:
             page = self.overview.runs(filter_of(question), _oldest(question), PART_SIZE)
-            marks = self.released()
-            rows = [
-                replace(run, duplicates=marks.get(run.run_id, run.duplicates))
-                for run in page.rows[::-1]
-            ]
-            return _part(question, page, rows)
+            released = self.store.read.released()
+            return _part(question, page, [run.marked(released) for run in page.rows[::-1]])
         report = Report(self.store, filter_of(question))
         name = question.path.lstrip("/")
         return Answer(make(report).encode("utf-8"), media_type, file_name=name)
@@ -259,7 +250,7 @@ class SupervisorPages:
             is_over=newest.run.state is not RunState.RUNNING,
             page=page,
             shown=shown,
-            released=self.released(),
+            released=self.store.read.released(),
             story=story if isinstance(story, Story) else None,
             no_story=story if isinstance(story, str) else "",
             drawn=None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -25,7 +25,6 @@ from flasher.protocol.text import printable
 from flasher.station.records.capability import VALUES_MIN, Basis, Capability
 from flasher.station.records.errors import NotFoundError, UnprovenError
 from flasher.station.records.model import (
-    RELEASED_MARK,
     TORN_TRACE,
     TRACE,
     AttachmentFile,
@@ -182,24 +181,14 @@ def unit(
                     story = explained(store.files, file)
                     stories.setdefault(details.run.run_id, []).append(story)
                     traces.append(_trace_document(details.run.run_id, file, story, full=full))
-        shown = _with_marks(life, store.read.released())
+        released = store.read.released()
+        marked = tuple(replace(each, run=each.run.marked(released)) for each in life.runs)
+        shown = replace(life, runs=marked)
         output.results(unit_lines(shown, stories, full=full))
         if page is not None:
             write_whole(page, certificate(store, life), "--certificate")
             output.progress(f"page: {printable(str(page))}")
         return output.document(UnitDocument(unit=shown, traces=traces))
-
-
-def _with_marks(life: UnitLife, released: Collection[int]) -> UnitLife:
-    return replace(
-        life,
-        runs=tuple(
-            replace(each, run=replace(each.run, duplicates=RELEASED_MARK))
-            if each.run.run_id in released
-            else each
-            for each in life.runs
-        ),
-    )
 
 
 def _trace_document(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import UTC, date, datetime
 from enum import IntEnum, StrEnum
 from pathlib import Path
@@ -479,6 +479,10 @@ class RunRecord:
     def is_unchecked(self) -> bool:
         """True if it was not checked whether the unit has passed at another station."""
         return self.duplicates not in (None, CHECKED)
+
+    def marked(self, released: Collection[int]) -> RunRecord:
+        """The run with `RELEASED_MARK` if it is one of these."""
+        return replace(self, duplicates=RELEASED_MARK) if self.run_id in released else self
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,6 @@ from flasher.station.records.filters import JUDGED, counting, filtered
 from flasher.station.records.heads import ChainHead
 from flasher.station.records.model import (
     DUPLICATES,
-    RELEASED_MARK,
     SIGNATURE,
     AuditEvent,
     Figures,
@@ -251,12 +250,8 @@ def runs_of(
     connection: Connection, query: Select[Any], released: Collection[int]
 ) -> list[RunRecord]:
     """Runs of a `RUN_QUERY`, those in `released` with their mark. Raises RecordsDamagedError."""
-    marks = dict.fromkeys(released, RELEASED_MARK)
     rows = connection.execute(query).mappings()
-    return [
-        valid(_RUN, {**row, "duplicates": marks.get(row["run_id"], row["duplicates"])})
-        for row in rows
-    ]
+    return [valid(_RUN, dict(row)).marked(released) for row in rows]
 
 
 def valid(kind: TypeAdapter[_Row], row: Mapping[str, Any]) -> _Row:
