@@ -14,7 +14,7 @@ from enum import StrEnum
 from itertools import chain as joined
 from typing import Annotated, Any, Final, Generic, TypeVar
 
-from pydantic import BeforeValidator, TypeAdapter
+from pydantic import BeforeValidator
 from sqlalchemy import Connection, Select, and_, case, exists, func, literal, or_, select, union_all
 from sqlalchemy.sql.expression import ColumnElement
 
@@ -124,12 +124,6 @@ class AuditRow:
     hash: str
 
 
-_ANY: Final = TypeAdapter(dict[str, Any])
-_RUN: Final = TypeAdapter(RunRecord)
-_HOLDER: Final = TypeAdapter(InstalledUnit)
-_AUDIT: Final = TypeAdapter(AuditRow)
-
-
 class Overview:
     """Queries of the pages. Every method raises RecordError if the records cannot be read."""
 
@@ -141,7 +135,7 @@ class Overview:
         run_id = schema.run.c.id
         with self._database.reading() as connection:
             found = newest_runs(connection, chosen, cursor, size + 1)
-        return self._page(_RUN, RUN_QUERY.where(run_id.in_(found)), run_id, cursor, size)
+        return self._page(RunRecord, RUN_QUERY.where(run_id.in_(found)), run_id, cursor, size)
 
     def parts(self, serial: str) -> tuple[str, ...]:
         unit = schema.unit.c
@@ -155,7 +149,8 @@ class Overview:
         run_id = schema.run.c.id
         with self._database.reading() as connection:
             last = newest_runs(connection, RunFilter(serial=serial, part=part), cursor, size + 1)
-        page = self._page(_ANY, select(run_id).where(run_id.in_(last)), run_id, cursor, size)
+        query = select(run_id).where(run_id.in_(last))
+        page = self._page(dict[str, Any], query, run_id, cursor, size)
         with self._database.reading() as connection:
             found = tuple(details_of(connection, run_id.in_([row["id"] for row in page.rows])))
         return Page(found[::-1], page.older, page.newer)
@@ -214,7 +209,7 @@ class Overview:
     ) -> Page[InstalledUnit]:
         """A page of the units whose last transfer to a target was of this image."""
         query = _holders(self._artifacts(sha256))
-        return self._page(_HOLDER, query, schema.run_target.c.id, cursor, size)
+        return self._page(InstalledUnit, query, schema.run_target.c.id, cursor, size)
 
     def holder_count(self, sha256: str) -> int:
         """Number of these units, counted up to `HOLDERS_COUNTED` plus one."""
@@ -359,11 +354,11 @@ class Overview:
             if low is None:
                 return Page((), None, None)
             query = query.where(audit.id >= low, audit.id <= high, *within)
-        return self._page(_AUDIT, query, audit.id, cursor, size)
+        return self._page(AuditRow, query, audit.id, cursor, size)
 
     def _page(
         self,
-        kind: TypeAdapter[_Row],
+        kind: type[_Row],
         query: Select[Any],
         row_id: Any,
         cursor: PageCursor,

@@ -5,7 +5,8 @@ from __future__ import annotations
 import statistics
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict
-from typing import Any, Final, TypeVar
+from functools import cache
+from typing import Any, Final, TypeVar, cast
 
 from pydantic import TypeAdapter, ValidationError
 from sqlalchemy import Connection, Select, literal, select
@@ -49,42 +50,40 @@ _DUPLICATES: Final = (
     .scalar_subquery()
     .label("duplicates")
 )
-_OF: Final = schema.run.c
+_RUN: Final = schema.run.c
 RUN_QUERY: Final = (
     select(
-        _OF.id.label("run_id"),
+        _RUN.id.label("run_id"),
         schema.unit.c.serial,
         schema.unit.c.part,
         schema.lot.c.name.label("lot"),
-        _OF.kind,
-        _OF.is_virtual,
-        _OF.reason,
-        _OF.state,
-        _OF.code,
-        _OF.text,
-        _OF.begun_at,
-        _OF.ended_at,
-        (_OF.ended_monotonic_s - _OF.begun_monotonic_s).label("duration_s"),
+        _RUN.kind,
+        _RUN.is_virtual,
+        _RUN.reason,
+        _RUN.state,
+        _RUN.code,
+        _RUN.text,
+        _RUN.begun_at,
+        _RUN.ended_at,
+        (_RUN.ended_monotonic_s - _RUN.begun_monotonic_s).label("duration_s"),
         schema.station.c.name.label("station"),
         schema.socket.c.name.label("socket"),
         schema.operator.c.name.label("operator"),
         schema.recipe.c.name.label("recipe"),
         schema.recipe.c.revision.label("recipe_revision"),
         schema.recipe.c.sha256.label("recipe_sha256"),
-        _OF.verification_reached.label("verified"),
-        _OF.log_sha256,
+        _RUN.verification_reached.label("verified"),
+        _RUN.log_sha256,
         _DUPLICATES,
     )
-    .join_from(schema.run, schema.unit, _OF.unit_id == schema.unit.c.id)
-    .join(schema.recipe, _OF.recipe_id == schema.recipe.c.id)
-    .outerjoin(schema.lot, _OF.lot_id == schema.lot.c.id)
-    .join(schema.socket, _OF.socket_id == schema.socket.c.id)
+    .join_from(schema.run, schema.unit, _RUN.unit_id == schema.unit.c.id)
+    .join(schema.recipe, _RUN.recipe_id == schema.recipe.c.id)
+    .outerjoin(schema.lot, _RUN.lot_id == schema.lot.c.id)
+    .join(schema.socket, _RUN.socket_id == schema.socket.c.id)
     .join(schema.station, schema.socket.c.station_id == schema.station.c.id)
-    .join(schema.operator, _OF.operator_id == schema.operator.c.id)
+    .join(schema.operator, _RUN.operator_id == schema.operator.c.id)
 )
 """Query of runs with the columns of `RunRecord`."""
-_DETAILS: Final = TypeAdapter(RunDetails)
-_RUN: Final = TypeAdapter(RunRecord)
 _NAMED: Final = ("unit", "station", "socket", "operator", "recipe")
 """Columns with a name that every run has."""
 
@@ -251,15 +250,21 @@ def runs_of(
 ) -> list[RunRecord]:
     """Runs of a `RUN_QUERY`, those in `released` with their mark. Raises RecordsDamagedError."""
     rows = connection.execute(query).mappings()
-    return [valid(_RUN, dict(row)).marked(released) for row in rows]
+    return [valid(RunRecord, dict(row)).marked(released) for row in rows]
 
 
-def valid(kind: TypeAdapter[_Row], row: Mapping[str, Any]) -> _Row:
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(kind)
+
+
+def valid(kind: type[_Row], row: Mapping[str, Any]) -> _Row:
     """The value of a row. Raises RecordsDamagedError for values that no station writes."""
     try:
-        return kind.validate_python(row)
+        found: _Row = _adapter(cast("Any", kind)).validate_python(row)
     except ValidationError as error:
         raise _damaged(error, row.get("run_id")) from error
+    return found
 
 
 def _damaged(error: ValidationError, run_id: object) -> RecordsDamagedError:
@@ -269,7 +274,8 @@ def _damaged(error: ValidationError, run_id: object) -> RecordsDamagedError:
         "The records contain a value that no station writes.",
         where=printable(name if run_id is None else f"run {run_id}, {name}"),
         cause=printable(f"{wrong['msg']}: {wrong['input']!r}"[:200]),
-        remedy="List all problems with flasher station verify.",
+        remedy="List all problems with flasher station verify, those of a plant with flasher plant"
+        " verify.",
     )
 
 
@@ -326,7 +332,7 @@ def details_of_content(content: Mapping[str, Any], recipe: Mapping[str, str]) ->
         each | {"measurements": [m for m in content["measurements"] if m["step_id"] == each["id"]]}
         for each in content["steps"]
     ]
-    return _DETAILS.validate_python(
+    details: RunDetails = _adapter(RunDetails).validate_python(
         {
             "run": run | facts | {"duplicates": found.get(DUPLICATES)},
             "targets": targets,
@@ -335,3 +341,4 @@ def details_of_content(content: Mapping[str, Any], recipe: Mapping[str, str]) ->
             "attachments": content["attachments"],
         }
     )
+    return details
