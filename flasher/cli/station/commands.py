@@ -367,7 +367,7 @@ class ReportOptions:
         "--csv", panel=_WRITTEN, brief=True, help="a table with a row for each run",
     )]  # fmt: skip
     json_report: Annotated[Path | None, _path_option(
-        "--json-report", panel=_WRITTEN, help="figures and runs, as JSON",
+        "--json-report", panel=_WRITTEN, help="figures, measurements and runs, as with --json",
     )]  # fmt: skip
     junit: Annotated[Path | None, _path_option(
         "--junit", panel=_WRITTEN, help="JUnit XML with a test case for each run",
