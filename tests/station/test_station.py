@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from typing import Any
+from typing import Any, NoReturn
 
 import pytest
 from sqlalchemy import event
@@ -35,9 +35,14 @@ from flasher.station.messages import (
     Stop,
     flash_value,
 )
-from flasher.station.records.errors import DiskFullError, RecordsLockedError
+from flasher.station.records.errors import (
+    DiskFullError,
+    RecordsDamagedError,
+    RecordsLockedError,
+)
 from flasher.station.records.model import (
     Measurement,
+    RunId,
     RunKind,
     RunResult,
     RunState,
@@ -46,6 +51,7 @@ from flasher.station.records.model import (
     Verified,
     WriteId,
 )
+from flasher.station.records.queries import Records
 from tests.station.factory import SERIAL, USUAL, Bench
 from tests.station.line_bench import LineBench, tried
 
@@ -553,6 +559,29 @@ def test_an_outcome_that_cannot_be_saved_is_never_green(line: LineBench, bench: 
     assert line.state("A") is SocketState.PASS
     assert line.of(LineResumed)
     other.close()
+
+
+def test_an_outcome_that_cannot_be_read_back_is_not_green_before_it_is(
+    line: LineBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line.scan(SERIAL)
+    line.arrive("A")
+    line.work("A")
+
+    def unreadable(_records: Records, run_id: RunId) -> NoReturn:
+        raise RecordsDamagedError(f"Run {run_id} cannot be read.")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Records, "run", unreadable)
+        line.end("A")
+    assert line.of(RunEnded) == []
+    assert line.state("A") is SocketState.ERROR
+    assert "cannot be read" in line.last(RecordNotSaved).reason
+    line.scan("RESUME")
+    assert line.last(RunEnded).run.state is RunState.PASS
+    assert line.state("A") is SocketState.PASS
+    assert [run.state for run in line.bench.store.read.table()] == [RunState.PASS], "saved once"
+    assert line.bench.store.examine().problems == ()
 
 
 @pytest.mark.parametrize("operation", ["intent", "verified", "step"])
