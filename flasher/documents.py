@@ -29,8 +29,8 @@ _CONFIG: Final[ConfigDict] = {
 
 @cache
 def adapter(kind: Any) -> TypeAdapter[Any]:
-    """Create the pydantic adapter of a type: enumerations as their words, bytes in hexadecimal. A
-    field `from_` is the key `from`.
+    """Create the pydantic adapter of a type, which reads values and writes them as JSON:
+    enumerations as their words, bytes in hexadecimal. A field `from_` is the key `from`.
     """
     from pydantic import TypeAdapter, with_config  # noqa: PLC0415  for JSON only
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import statistics
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict
-from functools import cache
 from typing import Any, Final, TypeVar, cast
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 from sqlalchemy import Connection, Select, literal, select
 
+from flasher.documents import adapter
 from flasher.protocol.text import printable
 from flasher.station.records import chain, schema
 from flasher.station.records.capability import Capability, capabilities
@@ -253,15 +253,10 @@ def runs_of(
     return [valid(RunRecord, dict(row)).marked(released) for row in rows]
 
 
-@cache
-def _adapter(kind: Any) -> TypeAdapter[Any]:
-    return TypeAdapter(kind)
-
-
 def valid(kind: type[_Row], row: Mapping[str, Any]) -> _Row:
     """The value of a row. Raises RecordsDamagedError for values that no station writes."""
     try:
-        found: _Row = _adapter(cast("Any", kind)).validate_python(row)
+        found: _Row = adapter(cast("Any", kind)).validate_python(row)
     except ValidationError as error:
         raise _damaged(error, row.get("run_id")) from error
     return found
@@ -332,7 +327,7 @@ def details_of_content(content: Mapping[str, Any], recipe: Mapping[str, str]) ->
         each | {"measurements": [m for m in content["measurements"] if m["step_id"] == each["id"]]}
         for each in content["steps"]
     ]
-    details: RunDetails = _adapter(RunDetails).validate_python(
+    details: RunDetails = adapter(RunDetails).validate_python(
         {
             "run": run | facts | {"duplicates": found.get(DUPLICATES)},
             "targets": targets,
