@@ -7,22 +7,32 @@ import logging
 import platform
 import threading
 import time
+import uuid
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from typing import Final
 
-from distributed import Client, Future, KilledWorker, Scheduler, Worker, WorkerPlugin, as_completed
+from distributed import (
+    Client,
+    Future,
+    KilledWorker,
+    Scheduler,
+    Worker,
+    WorkerPlugin,
+    as_completed,
+    get_worker,
+)
 from distributed.comm.addressing import resolve_address
 from distributed.core import Status
 
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
 from flasher.simulate.campaign import Batch, Result, campaign_key, run_batch
-from flasher.simulate.workers import BATCH_S, OnResult, Pace, RunBatch, run_alone
+from flasher.simulate.workers import BATCH_S, BatchProcess, OnResult, Pace, RunBatch
 
 ALLOWED_FAILURES: Final = 20
-"""Workers that may die with a batch before it runs alone."""
+"""Workers that may die with a batch before the campaign ends."""
 _FEW_CORES: Final = 50
 _LONG_BATCH_S: Final = 15.0
 """For more cores: the scheduler handles some hundred batches a second."""
@@ -33,26 +43,29 @@ _WORKER_S: Final = 60.0
 """Time in which the first worker has to be there."""
 _GATHER_S: Final = 10.0
 _POLL_S: Final = 0.05
-_PLUGIN: Final = "flasher-same-code"
-
 _SCHEDULER_ENDED: Final = "its scheduler ended or was restarted"
 
 _log: Final = logging.getLogger("flasher.simulate")
 # It warns of each worker that dies, on the terminal; what that means is handled here.
 logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
-_one_at_a_time: Final = threading.Lock()
-"""A worker may have several threads, but runs share the tables of their process."""
 
 
-class SameCode(WorkerPlugin):
-    """Closes a worker that joins with other code or another Python."""
+class CampaignPlugin(WorkerPlugin):
+    """Runs the batches of one campaign on a worker, in a process that it starts: a run that kills
+    its process, or is killed because it does not end, leaves the worker alive. Closes a worker that
+    joins with other code or another Python.
+    """
 
-    name = _PLUGIN
-
-    def __init__(self) -> None:
+    def __init__(self, run_one: RunBatch) -> None:
+        self.name = f"flasher-{uuid.uuid4().hex}"
         self.campaign, self.python = campaign_key(), platform.python_version()
+        self.run_one = run_one
 
     async def setup(self, worker: Worker) -> None:
+        self._process = BatchProcess(self.run_one)
+        self._is_over = threading.Event()
+        self._one_at_a_time = threading.Lock()
+        """A worker may have several threads, but has one process."""
         if self.campaign != campaign_key():
             why = _other_code(worker.address, campaign_key(), platform.python_version(), self)
             _log.error("%s", why.what)
@@ -60,6 +73,24 @@ class SameCode(WorkerPlugin):
             # it is registered, and takes none while it is paused.
             worker.status = Status.paused
             self._closing = asyncio.create_task(worker.close(reason=why.what))
+
+    def play(self, batch: Batch) -> Result:
+        with self._one_at_a_time:
+            result = self._process.run(batch, self._is_over.is_set)
+        if self._is_over.is_set():
+            self._end_process()
+        return result
+
+    def teardown(self, worker: Worker) -> None:
+        self._is_over.set()
+        self._end_process()
+
+    def _end_process(self) -> None:
+        if self._one_at_a_time.acquire(blocking=False):  # else the thread that has it does so
+            try:
+                self._process.end()
+            finally:
+                self._one_at_a_time.release()
 
 
 def run_on_cluster(
@@ -75,8 +106,9 @@ def run_on_cluster(
 
     Raises UsageError without a scheduler or a worker, and for workers of other code or Python.
     """
-    with _connected(address) as client:
-        todo = _Todo(client, batches, run_one)
+    plugin = CampaignPlugin(run_one)
+    with _connected(address, plugin) as client:
+        todo = _Todo(client, batches, plugin.name)
         try:
             while not is_stopped():
                 try:
@@ -95,7 +127,7 @@ def run_on_cluster(
 
 
 @contextmanager
-def _connected(address: str) -> Iterator[Client]:
+def _connected(address: str, plugin: CampaignPlugin) -> Iterator[Client]:
     shown = printable(address)
     try:
         resolve_address(address)  # a client that fails by its address ends 20 s later
@@ -114,8 +146,8 @@ def _connected(address: str) -> Iterator[Client]:
                 f"The Dask cluster at {shown} has no worker.",
                 remedy=f"Start one for each core: `dask worker {shown} --nthreads 1`.",
             ) from error
-        _check_code(client)
-        client.register_plugin(SameCode())
+        _check_code(client, plugin)
+        client.register_plugin(plugin)
         allowed = client.run_on_scheduler(_allow_failures(ALLOWED_FAILURES))
         try:
             yield client
@@ -123,7 +155,7 @@ def _connected(address: str) -> Iterator[Client]:
             with suppress(OSError):
                 if client.status == "running":
                     client.run_on_scheduler(_allow_failures(allowed))
-                    client.unregister_worker_plugin(_PLUGIN)
+                    client.unregister_worker_plugin(plugin.name)
 
 
 def _allow_failures(limit: int) -> Callable[[Scheduler], int]:
@@ -139,16 +171,15 @@ def _allow_failures(limit: int) -> Callable[[Scheduler], int]:
     return set_limit
 
 
-def _check_code(client: Client) -> None:
+def _check_code(client: Client, own: CampaignPlugin) -> None:
     """Raise UsageError if a worker has no flasher, or another one."""
-    own = SameCode()
     pythons = client.run(platform.python_version, on_error="return")
     for worker, campaign in client.run(campaign_key, on_error="return").items():
         if campaign != own.campaign:
             raise _other_code(worker, campaign, pythons.get(worker), own)
 
 
-def _other_code(worker: str, campaign: object, python: object, own: SameCode) -> UsageError:
+def _other_code(worker: str, campaign: object, python: object, own: CampaignPlugin) -> UsageError:
     its = "no flasher" if isinstance(campaign, Exception) else f"flasher {campaign}"
     return UsageError(
         f"The worker {printable(worker)} has {printable(str(its))} on Python {python}; this "
@@ -158,14 +189,9 @@ def _other_code(worker: str, campaign: object, python: object, own: SameCode) ->
     )
 
 
-def _play(run_one: RunBatch, batch: Batch) -> Result:
-    with _one_at_a_time:
-        return run_one(batch, lambda: False)
-
-
-def _play_alone(run_one: RunBatch, batch: Batch) -> Result:
-    with _one_at_a_time:
-        return run_alone(batch, run_one=run_one)
+def _play(plugin: str, batch: Batch) -> Result:
+    at_worker: CampaignPlugin = get_worker().plugins[plugin]
+    return at_worker.play(batch)
 
 
 def _lost(cause: str) -> UsageError:
@@ -179,9 +205,9 @@ def _lost(cause: str) -> UsageError:
 class _Todo:
     """Batches that are left, and those that the cluster has."""
 
-    def __init__(self, client: Client, batches: Iterable[Batch], run_one: RunBatch) -> None:
+    def __init__(self, client: Client, batches: Iterable[Batch], plugin: str) -> None:
         self._client = client
-        self._run_one = run_one
+        self._plugin = plugin
         self._pace = Pace()
         self._parts = self._pace.cut(batches)
         self._window = 1
@@ -199,24 +225,21 @@ class _Todo:
             batch = next(self._parts, None)
             if batch is None:
                 break
-            self._submit(_play, batch)
+            key = (
+                self._plugin,
+                batch.campaign,
+                batch.canary,
+                int(batch.is_corpus),
+                batch.first,
+                batch.count,
+            )
+            future = self._client.submit(_play, self._plugin, batch, key=key)
+            self._running[future.key] = future, batch
+            self._completed.add(future)
         return bool(self._running)
 
-    def _submit(self, play: Callable[[RunBatch, Batch], Result], batch: Batch) -> None:
-        key = (
-            play.__name__,
-            batch.campaign,
-            batch.canary,
-            int(batch.is_corpus),
-            batch.first,
-            batch.count,
-        )
-        future = self._client.submit(play, self._run_one, batch, key=key)
-        self._running[future.key] = future, batch
-        self._completed.add(future)
-
     def ended(self) -> list[tuple[Batch, Result]]:
-        """Return the results that have come since; batches whose workers died run alone."""
+        """Return the results that have come since."""
         results = []
         for future in self._completed.next_batch(block=False):
             _, batch = self._running[future.key]
@@ -229,9 +252,7 @@ class _Todo:
                 self._completed.add(future)
                 continue
             except KilledWorker as error:
-                if future.key[0] == _play_alone.__name__:
-                    raise _lost("its workers died of something else than a batch") from error
-                self._submit(_play_alone, batch)
+                raise _lost(f"{error.allowed_failures + 1} workers died with it") from error
             except CancelledError as error:
                 raise _lost(_SCHEDULER_ENDED) from error
             else:

@@ -88,16 +88,13 @@ def run(
 
     def run_parts() -> None:
         try:
-            with _Worker(run_one) as worker:
+            with BatchProcess(run_one) as worker:
                 while not stops():
                     with parts_lock:
                         batch = next(parts, None)
                     if batch is None:
                         return
-                    try:
-                        result = worker.run(batch, stops)
-                    except EOFError:
-                        result = run_alone(batch, stops, run_one)
+                    result = worker.run(batch, stops)
                     with parts_lock:
                         pace.add(result)
                     ended.put((batch, result))
@@ -119,7 +116,7 @@ def run(
             has_failed.set()  # an error of one ends the others
 
 
-class _Worker:
+class BatchProcess:
     """A process that runs batches, one at a time, through a pipe of its own: a process that is
     killed while it reads from a shared queue keeps the lock of the queue. A new process replaces
     one that was killed.
@@ -136,13 +133,19 @@ class _Worker:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._end()
+        self.end()
 
     def run(self, batch: Batch, is_stopped: Callable[[], bool]) -> Result:
-        """Run a batch; once stopped, return the result of the runs until then.
-
-        Raises EOFError if the process is killed, and the error that `run_one` raises.
+        """Run a batch, seed by seed (`run_alone`) if that kills the process; once stopped, return
+        the result of the runs until then. Raises the error that `run_one` raises.
         """
+        try:
+            return self.run_once(batch, is_stopped)
+        except EOFError:
+            return run_alone(batch, is_stopped, self._run_one)
+
+    def run_once(self, batch: Batch, is_stopped: Callable[[], bool]) -> Result:
+        """As `run`, but raises EOFError if the process is killed."""
         if self._pipe is None:
             self._pipe = self._started()
         is_stop_sent = False
@@ -156,7 +159,7 @@ class _Worker:
         except (EOFError, OSError) as error:  # OSError: while it sent
             if self._process is not None:
                 self._process.join(_JOIN_S)
-            self._end()
+            self.end()
             raise EOFError from error
         if isinstance(result, Exception):
             raise result
@@ -179,7 +182,7 @@ class _Worker:
                 config["daemon"] = is_daemon
         return pipe
 
-    def _end(self) -> None:
+    def end(self) -> None:
         if self._process is not None and self._pipe is not None:
             self._process.kill()
             self._process.join()
@@ -243,10 +246,10 @@ def run_alone(
     """
     total = Result(batch.campaign)
     seed, end, suspect = batch.first, batch.first + batch.count, -1
-    with _Worker(run_one) as worker:
+    with BatchProcess(run_one) as worker:
         while seed < end and not is_stopped():
             try:
-                result = worker.run(replace(batch, first=seed, count=1), is_stopped)
+                result = worker.run_once(replace(batch, first=seed, count=1), is_stopped)
             except EOFError:
                 if seed != suspect:
                     suspect = seed

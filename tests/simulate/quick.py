@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -59,6 +60,13 @@ def run_killing(batch: Batch, is_stopped: Callable[[], bool] = lambda: False) ->
     if not batch.canary and KILLER in range(batch.first, batch.first + batch.count):
         os._exit(3)
     time.sleep(0.02)  # so that others run beside it
+    return run_quickly(batch, is_stopped)
+
+
+def run_killing_worker(batch: Batch, is_stopped: Callable[[], bool] = lambda: False) -> Result:
+    """Run `KILLER` kills the worker that started its process."""
+    if KILLER in range(batch.first, batch.first + batch.count):
+        os.kill(os.getppid(), signal.SIGKILL)
     return run_quickly(batch, is_stopped)
 
 

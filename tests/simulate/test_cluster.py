@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 
@@ -12,11 +13,21 @@ from distributed import Client, LocalCluster
 
 from flasher.errors import UsageError
 from flasher.simulate import cluster as clusters
-from flasher.simulate.campaign import Batch, Result, batches, run_batch
+from flasher.simulate import workers
+from flasher.simulate.campaign import Batch, Result, batches, campaign_key, run_batch
 from flasher.simulate.cluster import run_on_cluster
 from flasher.simulate.workers import RunBatch
 
-from .quick import no_result, run_killing, run_quickly, run_slowly, text_of
+from .quick import (
+    KILLER,
+    no_result,
+    run_endlessly,
+    run_killing,
+    run_killing_worker,
+    run_quickly,
+    run_slowly,
+    text_of,
+)
 from .test_workers import expected, never, without_canaries
 
 pytestmark = [
@@ -55,15 +66,48 @@ def test_a_cluster_counts_what_one_process_does(cluster: LocalCluster) -> None:
 
 
 def test_the_run_that_ends_its_process_is_a_violation_and_all_others_count(
-    cluster: LocalCluster, monkeypatch: pytest.MonkeyPatch
+    cluster: LocalCluster,
 ) -> None:
-    monkeypatch.setattr(clusters, "ALLOWED_FAILURES", 1)
     allowed = cluster.scheduler.allowed_failures
     found = on_cluster(cluster, [*batches(0, 60, 20)], run_killing)
     assert found.violations == expected(60).violations
     assert (found.runs, found.endings["killed"]) == (60, 1)
     assert sum(found.canaries_found.values()) == 1
     assert cluster.scheduler.allowed_failures == allowed
+
+
+def test_a_run_without_an_end_is_a_violation_and_its_worker_lives_on(
+    cluster: LocalCluster,
+) -> None:
+    """Which it has to without a nanny: no other one is started."""
+    results = [no_result()]
+    with Client(cluster.scheduler_address, set_as_default=False) as client:
+        before = client.run(os.getpid)
+        run_s = client.run(limit_runs, 0.2)
+        give_up_s = time.perf_counter() + 120
+        try:
+            run_on_cluster(
+                cluster.scheduler_address,
+                [Batch(campaign_key(), KILLER, 1), Batch(campaign_key(), 0, 5)],
+                on_result=lambda _batch, result: results.append(result),
+                is_stopped=lambda: time.perf_counter() > give_up_s,
+                run_one=run_endlessly,
+            )
+            assert client.run(os.getpid) == before
+        finally:
+            client.run(limit_runs, max(run_s.values()))
+    found = sum(results[1:], results[0])
+    assert found.runs == 6
+    assert [(each.seed, each.text) for each in found.violations if each.kind == "KILLED"] == [
+        (KILLER, "the run took more than 0.2 s of CPU time")
+    ]
+
+
+def limit_runs(run_s: float) -> float:
+    """In a worker: change the time that a run may take; return what it was."""
+    before = workers._RUN_S
+    workers._RUN_S = run_s  # type: ignore[misc]
+    return before
 
 
 def test_a_worker_that_is_killed_changes_nothing(cluster: LocalCluster) -> None:
@@ -90,6 +134,15 @@ def test_a_worker_that_is_killed_changes_nothing(cluster: LocalCluster) -> None:
     )
 
 
+def test_a_batch_that_no_worker_survives_ends_the_campaign(
+    cluster: LocalCluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(clusters, "ALLOWED_FAILURES", 0)
+    with pytest.raises(UsageError) as lost:
+        on_cluster(cluster, without_canaries(KILLER + 1, KILLER + 1), run_killing_worker)
+    assert "1 workers died" in lost.value.cause
+
+
 def test_a_stop_ends_the_campaign_and_leaves_the_cluster_as_it_was(cluster: LocalCluster) -> None:
     results: list[Result] = []
     run_on_cluster(
@@ -100,7 +153,7 @@ def test_a_stop_ends_the_campaign_and_leaves_the_cluster_as_it_was(cluster: Loca
         run_one=run_slowly,
     )
     assert 0 < sum(each.runs for each in results) < 1000
-    assert clusters._PLUGIN not in cluster.scheduler.worker_plugins
+    assert not any(name.startswith("flasher") for name in cluster.scheduler.worker_plugins)
     assert text_of(on_cluster(cluster, without_canaries(20, 20), run_slowly)) == text_of(
         sum(map(run_quickly, without_canaries(20, 20)), no_result())
     )
@@ -109,8 +162,8 @@ def test_a_stop_ends_the_campaign_and_leaves_the_cluster_as_it_was(cluster: Loca
 def test_workers_of_other_code_are_refused_with_both_versions(
     cluster: LocalCluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    own = clusters.SameCode()
-    monkeypatch.setattr(clusters.SameCode, "__init__", other_code)
+    own = clusters.CampaignPlugin(run_quickly)
+    monkeypatch.setattr(clusters.CampaignPlugin, "__init__", other_code)
     with pytest.raises(UsageError) as refused:
         on_cluster(cluster, without_canaries(20, 20), run_quickly)
     assert f"has flasher {own.campaign} on Python {own.python};" in refused.value.what
@@ -118,12 +171,13 @@ def test_workers_of_other_code_are_refused_with_both_versions(
     assert "Install the same checkout" in refused.value.remedy
 
 
-def other_code(plugin: clusters.SameCode) -> None:
+def other_code(plugin: clusters.CampaignPlugin, run_one: RunBatch = run_quickly) -> None:
+    plugin.name, plugin.run_one = "flasher", run_one
     plugin.campaign, plugin.python = "0123456789abcdef", "3.99.0"
 
 
 def test_a_worker_of_other_code_that_joins_is_closed() -> None:
-    plugin = clusters.SameCode()
+    plugin = clusters.CampaignPlugin(run_quickly)
     other_code(plugin)
     with (
         LocalCluster(

@@ -131,8 +131,8 @@ def test_each_run_of_a_batch_has_the_time_limit_of_its_own(
 ) -> None:
     monkeypatch.setattr(workers, "_RUN_S", 0.2)
     batch = Batch(campaign_key(), KILLER, 1000)
-    with workers._Worker(run_endlessly) as worker, pytest.raises(EOFError):
-        worker.run(batch, never)
+    with workers.BatchProcess(run_endlessly) as worker, pytest.raises(EOFError):
+        worker.run_once(batch, never)
     assert worker.exit_code == -signal.SIGPROF
 
 
