@@ -81,6 +81,8 @@ class Output:
         self.write_stderr: Callable[[str], None] = _plain_stderr
         """Writes a text to stderr; replaced while a progress bar is on the screen."""
         self._is_stdout_lost = False
+        self.is_stdout_closed = False
+        """True once the program that reads stdout has ended (`| head`)."""
         self._has_begun = False
         """True after `begin_document`, until `document`."""
         # A lost terminal no longer reports that it is one.
@@ -198,6 +200,7 @@ class Output:
             write()
             sys.stdout.flush()
         except BrokenPipeError:
+            self.is_stdout_closed = True
             _give_up(sys.stdout)
         except OSError as error:
             _give_up(sys.stdout)

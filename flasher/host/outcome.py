@@ -115,6 +115,8 @@ class Outcome:
     unobserved_s: float = 0.0
     """Time since the update command in which the adapter was away, in seconds: whether another tool
     wrote to the device then is not known, and the device cannot be asked."""
+    frame_gap_s: float = 0.0
+    """Silence between the frames of a message, as chosen by the options."""
 
     @property
     def ok(self) -> bool:
@@ -155,6 +157,15 @@ class Outcome:
         elif self.ending is Ending.TWO_DEVICES and self.device_left.needs_rescue:
             explained = _TWO_PERHAPS_ERASED
         error = explained.error(self.ending, self.target, self.detail)
+        if self.ending in _UNANSWERED and self.frame_gap_s > UNUSUAL_FRAME_GAP_S:
+            error.cause = text(
+                "the device may drop messages whose frames are {gap_ms} ms apart; otherwise"
+                " {cause}",
+                gap_ms=f"{1000 * self.frame_gap_s:g}",
+                cause=error.cause,
+            )
+            shorter = text("Choose a shorter --frame-gap (frame_gap_s in a profile).")
+            error.remedy = text("{shorter} {remedy}", shorter=shorter, remedy=error.remedy)
         error.where = self.where
         error.remedy = with_device_state(error.remedy, self.device_left)
         error.needs_rescue = self.device_left.needs_rescue
@@ -162,6 +173,12 @@ class Outcome:
         return error
 
 
+UNUSUAL_FRAME_GAP_S: Final = 0.01
+"""Adapters and computers cause shorter gaps by themselves. The documents give no limit for a
+device (R12)."""
+_UNANSWERED: Final = frozenset(
+    {Ending.NO_BOOT_VERSION, Ending.NO_REQUEST, Ending.UNHEARING, Ending.PACKET_FAILED}
+)
 _WAIVERS: Final = {
     Ending.WRONG_DEVICE: waivers.BOOT_NAME,
     Ending.BOOT_TOO_OLD: waivers.BOOT_VERSION,

@@ -1043,6 +1043,7 @@ class UpgradeStage:
             waiver=self.unchecked.waiver if self.unchecked and ending is Ending.UNCHECKED else "",
             sent_into_silence=self._silence_was_answered,
             unobserved_s=self._at.unobserved_s,
+            frame_gap_s=self._options.frame_gap_s,
         )
 
 

@@ -106,6 +106,7 @@ Stream = Callable[[], contextlib.AbstractContextManager[TextIO]]
     [
         (("--help",), ExitCode.OK),
         (("image-info", OBC_BIN), ExitCode.OK),
+        (("monitor", "--mock", "--mock-speed", "0", "--count", "3", "--table"), ExitCode.OK),
         (MOCK, ExitCode.OK),
         ((*MOCK, "--json"), ExitCode.OK),
         (("flash", str(SAMPLES / "bad" / "no_end.hex"), "-t", "obc", "--json"), ExitCode.IMAGE),
@@ -117,6 +118,19 @@ def test_a_reader_that_goes_away_does_not_change_the_exit_code(
     with broken_pipe() as stream:
         monkeypatch.setattr("sys.stdout", stream)
         assert main(words) == code
+
+
+@posix_pipes
+@pytest.mark.parametrize("more", [(), ("--json",)])
+def test_a_monitor_whose_reader_goes_away_ends(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, more: tuple[str, ...]
+) -> None:
+    words = ("monitor", "--mock", "--mock-speed", "0", "--count", "9", *more)
+    with broken_pipe() as stream:
+        monkeypatch.setattr("sys.stdout", stream)
+        assert main(words) == ExitCode.OK
+    shown = capsys.readouterr().err.splitlines()[-1]
+    assert int(shown.split()[0]) <= 2
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from typing import Any
 
 import pytest
 
+from flasher.cli.main import main
 from flasher.errors import ExitCode
 from flasher.plant.process import Sending, sending
 from flasher.plant.schema import PLANT_SCHEMA
@@ -29,6 +30,7 @@ from flasher.station.records.errors import RecordError
 from flasher.station.records.overview import Overview
 from tests.cli.conftest import Flasher
 from tests.cli.station_threads import ThreadPort
+from tests.cli.test_main import broken_pipe, posix_pipes
 from tests.cli.test_schema import hold_output
 from tests.plant.conftest import plant, sender
 from tests.plant.factory import PASSWORD, Plant, Sender
@@ -390,6 +392,30 @@ def test_units_are_printed_while_they_are_read(
         assert document["error"]["what"].endswith("the server ended.")
     else:
         assert cut.out.splitlines() == whole.out.splitlines()[:3]
+
+
+@posix_pipes
+@pytest.mark.parametrize("words", [(), ("--json",)])
+def test_units_that_no_reader_wants_are_not_read(
+    plant: Plant, sender: Sender, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    for number in range(3):
+        sender.bench.make(serial=f"W260500{number}")
+    sender.send()
+    pages: list[object] = []
+    holders = Overview.holders
+
+    def counted(*asked: Any) -> Any:
+        pages.append(asked)
+        return holders(*asked)
+
+    monkeypatch.setattr("flasher.cli.plant.reading._AT_ONCE", 1)
+    monkeypatch.setattr(Overview, "holders", counted)
+    with broken_pipe() as stream:
+        monkeypatch.setattr("sys.stdout", stream)
+        command = ("plant", "units", "--image", BMS_SHA256, "--database")
+        assert main((*command, plant.url("flasher_desk"), *words)) == ExitCode.OK
+    assert len(pages) == 1
 
 
 def test_a_process_that_cannot_start_now_or_is_killed_is_started_again(

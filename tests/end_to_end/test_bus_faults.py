@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
@@ -20,6 +21,7 @@ from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, OBC, TARGETS, WELLING, WMC
+from flasher.protocol.timing import DEFAULT_TIMINGS
 from tests.end_to_end.world import Traffic, upgrade
 from tests.loops import each
 
@@ -272,3 +274,17 @@ def test_slow_receivers_get_their_gaps() -> None:
     transfer_s = outcome.statistics.transfer_s
     assert transfer_s is not None
     assert transfer_s > 3 * (17 * 0.002 + 0.01)
+
+
+@each("gap_s, is_named", [(0.005, False), (0.03, True)])
+def test_an_unusual_gap_is_named_where_the_device_does_not_react(
+    gap_s: float, *, is_named: bool
+) -> None:
+    timings = replace(DEFAULT_TIMINGS, inter_frame_timeout_s=0.004)
+    device = MockDevice(BMS, bitrate_bps=WELLING.bitrate_bps, profile=SMALL, timings=timings)
+    outcome = upgrade(device, image=IMAGE, options=UpgradeOptions(frame_gap_s=gap_s))
+    assert outcome.ending is Ending.NO_BOOT_VERSION
+    error = outcome.error()
+    assert error is not None
+    assert ("30 ms apart" in error.cause) is is_named
+    assert ("Choose a shorter --frame-gap" in error.remedy) is is_named

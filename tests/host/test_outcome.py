@@ -130,6 +130,17 @@ def test_the_next_step_depends_on_what_was_tried_and_on_what_is_left() -> None:
     assert late.code is ErrorCode.TWO_DEVICES
 
 
+@each("ending", [Ending.NO_REQUEST, Ending.UNHEARING, Ending.PACKET_FAILED, Ending.REFUSED])
+def test_an_unusual_frame_gap_is_a_likely_cause_of_silence_only(ending: Ending) -> None:
+    usual, unusual = (outcome(ending, frame_gap_s=gap_s).error() for gap_s in (0.01, 0.05))
+    assert usual is not None
+    assert unusual is not None
+    is_silence = ending is not Ending.REFUSED
+    assert ("50 ms apart" in unusual.cause) is is_silence
+    assert unusual.cause.endswith(usual.cause)
+    assert "apart" not in usual.cause
+
+
 def test_what_was_seen_stands_in_brackets_and_the_waiver_is_named() -> None:
     seen = outcome(Ending.WRONG_DEVICE, detail="boot version 'OBC'").error()
     assert seen is not None

@@ -127,22 +127,26 @@ def monitor(
         pulse_s=REFRESH_S if view.is_live else None,
         dialect=bus.dialect,
     )
+
+    def is_over() -> bool:
+        return stop() or output.is_stdout_closed  # `| head` ends it
+
     with ExitStack() as stack:
         if trace is None:
             bus = choose_adapter(bus, output)
             connection = stack.enter_context(bus.connect(target or BMS, asks=False))
             view.name = printable(connection.name)
-            cancelled = stack.enter_context(stop_on_signal())
+            stop = stack.enter_context(stop_on_signal())
             output.progress(f"watching {view.name}; Ctrl-C ends it")
             stack.enter_context(view)
-            drive(watcher, connection.link, connection.clock, on_event=view, cancelled=cancelled)
+            drive(watcher, connection.link, connection.clock, on_event=view, cancelled=is_over)
         else:
             from flasher.trace.reader import read_trace  # noqa: PLC0415  loads python-can
 
             view.name = printable(trace)
-            cancelled = stack.enter_context(stop_on_signal())
+            stop = stack.enter_context(stop_on_signal())
             stack.enter_context(view)
-            replay(watcher, read_trace(trace), view, cancelled)
+            replay(watcher, read_trace(trace), view, is_over)
     output.progress(
         f"{counted(view.messages, 'message')} shown of {counted(watcher.frames, 'frame')}, "
         f"{view.troubles:,} with trouble"

@@ -191,7 +191,10 @@ class TableView(MonitorView):
         if self._live is not None:
             self._live.stop()
         if kind is None:
-            self._console.print(self._view_now())
+            # Rich would end the program where the reader of stdout has gone.
+            with self._console.capture() as table:
+                self._console.print(self._view_now())
+            self.output.text(table.get())
 
     def show(self, seen: BusEvent, at_s: float, changed: frozenset[str]) -> None:
         self._last_at = seen.at

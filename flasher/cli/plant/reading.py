@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import closing
 from functools import partial
+from itertools import takewhile
 from pathlib import Path
 
 from flasher.cli.bar import Bar
@@ -79,12 +80,13 @@ def units(output: Output, url: str, wanted: str) -> int:
                 remedy="Give its SHA-256, the beginning of it, or the whole version;"
                 " flasher image-info IMAGE shows both.",
             )
-        found = (
+        units = (
             unit
             for sha256 in dict.fromkeys(each.sha256 for each in images)
             for unit in _holders(overview, sha256)
         )
-        # Hundreds of thousands: they are printed as they come.
+        # Hundreds of thousands: they are printed as they come, and `| head` ends it.
+        found = takewhile(lambda _unit: not output.is_stdout_closed, units)
         output.begin_document(PlantUnitsDocument(images, []), "units", found)
         if not output.json_wanted:
             output.results(printable(line) for line in _unit_lines(images, found))

@@ -21,7 +21,7 @@ from flasher.errors import UsageError
 from flasher.protocol.text import printable
 from flasher.station.adapters import check_samples, detect, resolve
 from flasher.station.config import load_config
-from flasher.station.operators import load_badges
+from flasher.station.operators import Crew, load_badges
 from flasher.station.recipe import fill
 from flasher.station.recipe_file import LoadedRecipe, load_checked
 from flasher.station.scans import Word
@@ -51,17 +51,20 @@ def golden(
             "The station has several sockets.",
             remedy=f"Give --socket with one of {', '.join(map(printable, names))}.",
         )
-    scans = [f"{Word.SOCKET.value} {socket or names[0]}", serial]
-    if config.badges:
-        people = load_badges(Path(config.badges), recipe.recipe.serial_number)
+
+    def scans(crew: Crew | None) -> list[str]:
+        of_unit = [f"{Word.SOCKET.value} {socket or names[0]}", serial]
+        if crew is None:
+            return of_unit
         badge = ask_secret("Badge: ")
-        if badge not in {each.code for each in people}:
+        if badge not in crew.codes:
             raise UsageError(
                 "This badge is not in the badge table.",
                 remedy="Run the command again, and scan the badge of a person in"
                 f" {printable(config.badges)}.",
             )
-        scans.insert(0, badge)
+        return [badge, *of_unit]
+
     pages = PagesOptions(None, None, None, web_insecure=False, language=None)
     return run(output, options, pages, records, golden=scans)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -75,7 +75,7 @@ def run(
     pages: PagesOptions,
     records: RecordsOptions,
     *,
-    golden: Sequence[str] = (),
+    golden: Callable[[Crew | None], Sequence[str]] | None = None,
 ) -> int:
     """Run the command and return its exit code. Without a terminal the output is JSON. `golden`:
     scans of one golden unit, which releases this flasher with the recipe.
@@ -83,20 +83,23 @@ def run(
     is_terminal = sys.stdout.isatty()
     if not (is_terminal or options.lines):
         output.json_wanted = True
-    scans = list(golden) or (None if options.scans is None else read_scans(options.scans))
+    scans = None if options.scans is None else read_scans(options.scans)
     day = datetime.now().astimezone().date()
     local = None if options.recipe is None else load_checked(options.recipe, day)
     config, sockets = _find_sockets(options, records.sockets)
-    if golden:
+    if golden is not None:
         config = config.model_copy(update={"plant_recipes": False, "golden_unit": "required"})
     if local is None and not config.plant_recipes:
         raise UsageError(
             "A station needs a recipe.",
             remedy="Give --recipe FILE, or set plant_recipes in the station file.",
         )
+    crew = None
     if local is not None:
         check_golden(config, local)
-        crew_of(options, config, local.recipe.serial_number)  # fails before records are created
+        # Fails before records are created.
+        crew = crew_of(options, config, local.recipe.serial_number)
+        scans = scans if golden is None else list(golden(crew))
     is_virtual = all(socket.bus is None for socket in sockets)
     view: View = Table(output)
     if output.json_wanted:
@@ -115,7 +118,8 @@ def run(
                 " (--ignore-approved: use it)."
             )
         recipe = recipes[sockets[0].config.name]
-        crew = crew_of(options, config, recipe.recipe.serial_number)
+        if recipe is not local:
+            crew = crew_of(options, config, recipe.recipe.serial_number)
         session = _Session(
             options, pages, output, store, view, crew, config, is_virtual,
             is_temporary=_is_temporary(options, records), has_scans=scans is not None,
