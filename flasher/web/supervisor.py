@@ -37,7 +37,7 @@ from flasher.station.certificate import (
 )
 from flasher.station.certificate_check import check_certificate
 from flasher.station.records import chain
-from flasher.station.records.capability import VALUES_MIN
+from flasher.station.records.capability import VALUES_MIN, figure
 from flasher.station.records.errors import NotFoundError, RecordError, UnprovenError
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import (
@@ -433,7 +433,7 @@ class SupervisorPages:
             limits_of=lambda each: limits_of(
                 Measurement(each.name, each.mean, each.unit, each.low, each.high)
             ),
-            digits=lambda value: translate.numbers(f"{value:.5g}"),
+            figure=lambda value: translate.numbers(figure(value)),
             values_min=VALUES_MIN,
             **self._choices(),
         )

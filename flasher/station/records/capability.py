@@ -60,10 +60,15 @@ class Capability:
 
     @property
     def limits(self) -> str:
-        low, high = (None if each is None else f"{each:g}" for each in (self.low, self.high))
+        low, high = (None if each is None else f"{each:,.10g}" for each in (self.low, self.high))
         if low is not None and high is not None:
             return f"{low} to {high}"
         return f"at most {high}" if low is None else f"at least {low}"
+
+
+def figure(value: float) -> str:
+    """Format a mean or a deviation: five significant digits, more for a large whole number."""
+    return f"{value:,.0f}" if abs(value) >= 99_999.5 else f"{value:,.5g}"
 
 
 def capabilities(connection: Connection, chosen: RunFilter) -> list[Capability]:
