@@ -181,7 +181,10 @@ class SimulatedBus:
             moment = self._sending_ends_at
         for device in self._devices:
             wanted = device.deadline
-            if wanted is not None and wanted < moment and not device.outbox:
+            if wanted is None or wanted >= moment or device.outbox:
+                continue
+            # While a frame is sent, a deadline in the past is that of the next one.
+            if sending is None or wanted > now:
                 moment = wanted
         self.clock.wait_until(moment)
         if sending is not None and self._sending_ends_at <= moment:
@@ -206,7 +209,9 @@ class SimulatedBus:
             self._sending = None
 
     def _serve_devices(self, now: float) -> None:
-        """Call every engine that is due; each device queues one frame at a time."""
+        """Call every engine that is due; each device queues one frame at a time, the next one when
+        that has been sent.
+        """
         anything_happened = False
         for device in self._devices:
             engine = device.engine
@@ -214,10 +219,11 @@ class SimulatedBus:
             if wanted is not None and wanted <= now:
                 anything_happened = True
                 engine.tick(now)
-            if not device.outbox and (frame := engine.next_frame(now)) is not None:
-                anything_happened = True
-                device.outbox.append((now, frame))
-                engine.frame_sent(now)
+                if not device.outbox and (frame := engine.next_frame(now)) is not None:
+                    device.outbox.append((now, frame))
+                    engine.frame_sent(now)
+            elif device.on_event is None:
+                continue
             for event in engine.take_events():
                 anything_happened = True
                 if device.on_event is not None:
@@ -427,7 +433,7 @@ class SimulatedLink:
     def _check_sending(self) -> None:
         if self._opened_at != self._bus.faults.times_unplugged:
             raise self._unplugged("sending")
-        if self.is_off:
+        if self._health.state is ControllerState.BUS_OFF:
             raise bus_off_error(str(self), "The adapter failed while sending: it is bus-off.")
 
     def _unplugged(self, doing: str) -> BusError:

@@ -11,7 +11,7 @@ from math import inf
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from flasher.bus.echoes import Echoes
-from flasher.bus.link import VirtualClock
+from flasher.bus.link import AT_ONCE, VirtualClock
 from flasher.bus.simulated import SimulatedBus, SimulatedLink
 from flasher.mock.model import MockDevice
 from flasher.mock.table import BootloaderState
@@ -90,6 +90,8 @@ class Agenda:
             heapq.heappop(self._heap)[2](now)
 
     def deadline(self) -> float | None:
+        if self._due:
+            return AT_ONCE
         return self._heap[0][0] if self._heap else None
 
     def next_frame(self, now: float) -> Frame | None:
@@ -216,7 +218,9 @@ class Unit:
     def deadline(self) -> float | None:
         due = self.engine.deadline()
         own = inf if due is None else due / self._rate + self._hung_s
-        if self._late:
+        if self._under_way:
+            own = AT_ONCE
+        elif self._late:
             own = min(own, self._late[0][0])
         return None if own == inf else max(own, self._hangs_until)
 
@@ -359,8 +363,10 @@ class PlanBus(SimulatedBus):
         self._sending = None
         if frame is None:
             return
-        # Of equal frames in the same bits the host's adapter returns its own as an echo.
-        sender = next((each for each in senders if each in self._hosts), senders[0])
+        sender = senders[0]
+        if len(senders) > 1:
+            # Of equal frames in the same bits the host's adapter returns its own as an echo.
+            sender = next((each for each in senders if each in self._hosts), sender)
         ends_at = self._sending_ends_at
         self._delivered_at = ends_at
         self.frames_carried += 1
@@ -419,10 +425,9 @@ class PlanBus(SimulatedBus):
             for device in self._devices:
                 if device not in senders and device is not self._agenda_node:
                     device.engine.receive(frame, now)
-        if self.faults.takes_part:
-            for host in self._hosts:
-                if host not in senders:
-                    host.inbox.append(frame)
+        host = self.host
+        if host is not None and self.faults.takes_part and host.node not in senders:
+            host.node.inbox.append(frame)
 
     def _disturbed(
         self, frame: Frame, word: plans.Sender, sender: Any, now: float

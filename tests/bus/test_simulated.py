@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from math import inf
 
 import pytest
 
@@ -43,7 +44,7 @@ class Talker:
         self.reports.append("woken")
 
     def deadline(self) -> float | None:
-        return self.wake_at
+        return -inf if self.outbox else self.wake_at
 
     def next_frame(self, now: float) -> Frame | None:
         return self.outbox[0] if self.outbox else None
@@ -61,6 +62,9 @@ class Talker:
 
 class Babbler(Talker):
     """Never lets anybody else speak."""
+
+    def deadline(self) -> float:
+        return -inf
 
     def next_frame(self, now: float) -> Frame | None:
         return Frame(0x000, bytes(8))

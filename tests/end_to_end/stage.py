@@ -212,6 +212,8 @@ class Speaker:
         self._next = now + self._every_s
 
     def deadline(self) -> float | None:
+        if self._is_due:
+            return float("-inf")
         return None if self._sent == self._limit else self._next
 
     def next_frame(self, now: float) -> Frame | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 from dataclasses import replace
+from math import inf
 
 import pytest
 
@@ -153,7 +154,7 @@ class Babbler:
         self._next = now + self._every_s
 
     def deadline(self) -> float | None:
-        return self._next
+        return -inf if self._due else self._next
 
     def next_frame(self, now: float) -> Frame | None:
         return self._frame if self._due else None
