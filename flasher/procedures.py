@@ -192,22 +192,22 @@ class Procedures:
             taps=(*self.watch.get("taps", ()), *taps),
             on_event=partial(self._emit, of_step=on_event),
             cancelled=(
-                partial(self._is_cancelled, hang_up_ends)
-                if may_cancel
-                else self.watch.get("ends_write")
+                self._cancellation(hang_up_ends) if may_cancel else self.watch.get("ends_write")
             ),
         )
 
     def _wait_until(self, moment: float, hang_up_ends: Callable[[], bool]) -> bool:
         """Wait until `moment`. Return True if cancelled or ended by a closed terminal."""
         self.clock.wait_until(moment)
-        return self._is_cancelled(hang_up_ends)
+        is_cancelled = self._cancellation(hang_up_ends)
+        return is_cancelled is not None and is_cancelled()
 
-    def _is_cancelled(self, hang_up_ends: Callable[[], bool] | None) -> bool:
+    def _cancellation(self, hang_up_ends: Callable[[], bool] | None) -> Callable[[], bool] | None:
+        """Return what is asked between frames; None if nothing can cancel."""
         cancelled, hung_up = self.watch.get("cancelled"), self.watch.get("hung_up")
-        if cancelled is not None and cancelled():
-            return True
-        return bool(hang_up_ends and hung_up and hung_up() and hang_up_ends())
+        if hang_up_ends is None or hung_up is None:
+            return cancelled
+        return lambda: (cancelled is not None and cancelled()) or (hung_up() and hang_up_ends())
 
     def _emit(self, event: object, of_step: EventHandler | None = None) -> None:
         log_event(event)
@@ -467,11 +467,13 @@ class Procedures:
             if isinstance(event, events.HostStalled):
                 stalls_s.append(event.stalled_s)
 
-        def note_sent(frame: Frame, *, sent: bool, now: float) -> None:  # noqa: ARG001  a tap
+        def watch_link(frame: Frame, *, sent: bool, now: float) -> None:
             nonlocal has_sent
-            has_sent = has_sent or sent
+            if sent:
+                has_sent = True
+            elif frame.is_error:
+                self._end_when_off(frame, sent=sent, now=now)
 
-        taps = (note_sent, self._end_when_off)
         may_end = _may_end(session)
         link = self.link
         before = link.health()
@@ -480,7 +482,7 @@ class Procedures:
         try:
             while True:
                 try:
-                    self.run(session, taps=taps, hang_up_ends=may_end, on_event=note_stall)
+                    self.run(session, taps=(watch_link,), hang_up_ends=may_end, on_event=note_stall)
                     break
                 except TransmitBlockedError as error:
                     received = self._await_contact(session, error, received)

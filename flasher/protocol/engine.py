@@ -170,7 +170,7 @@ class Transmitter:
         """Send a partly sent message again if this computer paused in it; return True if so. The
         receiver has dropped its first part, or refuses it (R12).
         """
-        is_stalled = self.begun and now - self._frame_sent_at > self._dropped_after_s
+        is_stalled = self._sent_frames > 0 and now - self._frame_sent_at > self._dropped_after_s
         if is_stalled:
             self._sent_frames = 0
             self.due_at = now + self._dropped_after_s * DROP_MARGIN

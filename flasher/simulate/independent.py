@@ -223,7 +223,7 @@ class IndependentDevice:
     # -- the engine ------------------------------------------------------------------------------
 
     def receive(self, frame: Frame, now: float) -> None:
-        if frame.can_id != self._hears_id or not frame.is_payload or not self.has_power:
+        if frame.can_id != self._hears_id or not frame.is_payload or self.state == "off":
             return
         if self.state == "erasing" and self._choices.deaf_in_erase:
             return
@@ -234,15 +234,11 @@ class IndependentDevice:
         if not partial and frame.data[:2] != b"\x55\xaa":
             return
         partial += frame.data
-        self._take_message(now)
+        if len(partial) >= 4 and len(partial) >= (size := 4 + partial[3] + 5):
+            self._take_message(size, now)
 
-    def _take_message(self, now: float) -> None:
+    def _take_message(self, size: int, now: float) -> None:
         partial = self._partial
-        if len(partial) < 4:
-            return
-        size = 4 + partial[3] + 5
-        if len(partial) < size:
-            return
         wire = bytes(partial[:size])
         restart = bytes(partial)
         partial.clear()
@@ -263,8 +259,9 @@ class IndependentDevice:
             act(at)
 
     def deadline(self) -> float | None:
-        alarm = self._alarms[0][0] if self._alarms else inf
-        due = min(alarm, self._outbox[0][0] if self._outbox else inf)
+        due = self._alarms[0][0] if self._alarms else inf
+        if self._outbox and self._outbox[0][0] < due:
+            due = self._outbox[0][0]
         return None if due == inf else due
 
     def next_frame(self, now: float) -> Frame | None:

@@ -616,10 +616,8 @@ class Player:
             unit.end_faults(self.clock.now())
 
     def _wait(self, until: float) -> None:
-        link = self.bus.link()
         while self.clock.now() < until:
             self.bus.advance(until)
-            link.drain()
 
     def _content(self, unit: Unit) -> str:
         return self._name(unit.application, unit)

@@ -165,7 +165,8 @@ class WireRules:
                     self._break("a message goes on after a gap in which the device dropped it")
                 self._had_gap = gap_s > limit_s
                 self._left -= len(data)
-                self._end_message(now, taken_at)
+                if self._left <= 0:
+                    self._end_message(now, taken_at)
             return None
         is_short = gap_s < DEFAULT_TIMINGS.inter_frame_timeout_s - _TOLERANCE_S
         # The device dropped a message whose rest came after a gap.
@@ -182,7 +183,8 @@ class WireRules:
             self._sent_twice.add(data)
         self._heads[data] = now
         self._check_begin(name, number, now, is_begun_again=is_begun_again)
-        self._end_message(now, taken_at)
+        if self._left <= 0:
+            self._end_message(now, taken_at)
         return Begun(name, number)
 
     def _check_begin(self, name: str, number: int, now: float, *, is_begun_again: bool) -> None:
@@ -240,8 +242,6 @@ class WireRules:
                 self._break("a packet is sent again before its answer is late")
 
     def _end_message(self, now: float, taken_at: float) -> None:
-        if self._left > 0:
-            return
         self._left = 0
         if self._kind == "packet":
             # The host does not know how long its frames wait for those before them (R12).
