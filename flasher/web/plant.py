@@ -26,7 +26,7 @@ from flasher.plant.deliveries import DeliveryState
 from flasher.plant.delivery_list import Delivery, DeliveryFilter, deliveries_of, receivers_of
 from flasher.station.records.overview import PAGE_SIZE, Page
 from flasher.web.query_processes import Answer, Question
-from flasher.web.supervisor import PAGES, SupervisorPages, cursor_of, id_in, moment_in
+from flasher.web.supervisor import CHECK, PAGES, SupervisorPages, cursor_of, id_in, moment_in
 
 STATIONS: Final = "/stations"
 """Path of the page of all stations."""
@@ -60,7 +60,8 @@ class PlantPages(SupervisorPages):
 
     @property
     def names(self) -> Mapping[str, str]:
-        return {STATIONS: text("Stations"), **super().names, DELIVERIES: text("Deliveries")}
+        usual = {path: name for path, name in super().names.items() if path != CHECK}
+        return {STATIONS: text("Stations"), **usual, DELIVERIES: text("Deliveries")}
 
     def stations(self, question: Question) -> Answer:
         """All stations with their checks; those with alerts first."""

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from datetime import UTC, datetime, timedelta
+from html import unescape
 from pathlib import Path
+from urllib.parse import parse_qsl, urlsplit
 
 import pytest
 
@@ -17,6 +20,7 @@ from flasher.station.records import rollup
 from flasher.station.records.capability import Capability
 from flasher.station.records.model import Admission, Order, RunFilter, RunState, Units
 from flasher.station.records.rollup import Rollup
+from flasher.web.plant import PLANT_PAGES
 from flasher.web.query_processes import Question
 from flasher.web.supervisor import SupervisorPages
 from tests.plant.factory import READER, Plant, Sender
@@ -188,7 +192,13 @@ def test_each_page_shows_the_units_of_all_stations(plant: Plant, sender: Sender)
         assert "line-3, A" in runs
         for path in ("/yield", "/times", "/images", "/audit"):
             assert pages.answer(Question(path)).status == 200
-        assert "line-3" in page(pages, "/units", serial="W2605003", part="BAT-36")
+        unit = page(pages, "/units", serial="W2605003", part="BAT-36")
+        assert "line-3" in unit
+        leads = [urlsplit(unescape(link)) for link in re.findall('href="(/[^"]*)"', unit)]
+        asked = [Question(each.path, dict(parse_qsl(each.query))) for each in leads]
+        here = [each for each in asked if each.path in PLANT_PAGES]
+        assert len(here) > 9
+        assert [each.path for each in here if pages.answer(each).status >= 400] == []
         refused = page(pages, "/units/certificate", serial="W2605003", part="BAT-36")
         assert "records of the station that made the run" in refused
 
