@@ -40,10 +40,12 @@ from flasher.simulate.reached import (
     exit_place,
     reachable,
     recorded_cells,
+    step_place,
     with_readings,
 )
 
 if TYPE_CHECKING:
+    from flasher.conformance.bench_options import BenchOptions
     from flasher.simulate.subject import SubjectBench
 
 VIOLATIONS_MAX: Final = 20
@@ -63,6 +65,8 @@ SUBJECT_CANARY: Final = CANARIES[1]
 """The one that is not in the device model."""
 _SUBJECT: Final = "-"
 """Between the hash of the code and that of the bootloader under test, in `Result.campaign`."""
+WALKS: Final = "+"
+"""The same before the hash of the device under test of a campaign of walks."""
 NO_FAULT: Final = "none"
 _TIMES_PER_OCTAVE: Final = 4
 """Classes of times: each 2^(1/4) times as long as the one before."""
@@ -84,6 +88,8 @@ class Batch:
     """Bootloader under test (see `BootloaderProcess`), which is the device of each plan."""
     target: str = ""
     """Of the subject."""
+    walks: BenchOptions | None = None
+    """Device under test of walks (`simulate.walks`); None for upgrades."""
 
     @property
     def bench(self) -> SubjectBench | None:
@@ -205,8 +211,16 @@ class Result:
         return sorted(self.reachable - {*self.reached})
 
     @property
+    def is_of_walks(self) -> bool:
+        return WALKS in self.campaign
+
+    @property
     def reachable(self) -> set[str]:
         """Places that a run can reach; a bootloader under test reaches none in the device model."""
+        if self.is_of_walks:
+            from flasher.conformance.explore.steps import reachable_pairs  # noqa: PLC0415  as above
+
+            return {step_place(phase.value, name) for phase, name in reachable_pairs()}
         is_subject = _SUBJECT in self.campaign
         return {
             each
@@ -228,7 +242,7 @@ def _sum(one: Mapping[Key, int], other: Mapping[Key, int]) -> dict[Key, int]:
 
 
 def campaign_key(subject: str = "", target: str = "") -> str:
-    """Return a hash of all that decides the result of a seed: the code, and Python's version; with
+    """Return a hash of all that decides the upgrade of a seed: the code, and Python's version; with
     a bootloader under test also a hash of that, as it is now.
     """
     if not subject:
@@ -280,7 +294,7 @@ def run_batch(batch: Batch, is_stopped: Callable[[], bool] = lambda: False) -> R
     Raises ValueError for a batch of other code, UsageError for one of another bootloader under
     test, or one that is changed meanwhile.
     """
-    _check_code(batch)
+    check_code(batch, campaign_key(batch.subject, batch.target))
     began_s = time.process_time()
     sums = _Sums()
     with without_log():
@@ -295,19 +309,23 @@ def run_batch(batch: Batch, is_stopped: Callable[[], bool] = lambda: False) -> R
                     verdict = play(plan, bench=batch.bench)
                     sums.add(seed - CORPUS_SEEDS * batch.is_corpus, plan, verdict)
             sums.reached |= cells
-    _check_code(batch)
+    check_code(batch, campaign_key(batch.subject, batch.target))
     return sums.result(batch.campaign, time.process_time() - began_s)
 
 
-def _check_code(batch: Batch) -> None:
-    key = campaign_key(batch.subject, batch.target)
+def check_code(batch: Batch, key: str) -> None:
+    """Raise ValueError for a batch of other code, UsageError for one whose device under test was
+    changed since. `key` is that of its campaign now.
+    """
     if batch.campaign == key:
         return
-    if not batch.campaign.startswith(_code_key() + _SUBJECT):
+    kind = len(_code_key()) + 1  # the code, and the mark after it
+    if batch.campaign[:kind] != key[:kind]:
         raise ValueError(f"a batch of {batch.campaign}; this is the code {key}")
+    what = f"The bootloader {printable(batch.subject)}" if batch.subject else "A file of the device"
     raise UsageError(
-        f"The bootloader {printable(batch.subject)} was changed during the campaign.",
-        cause="it was built again",
+        f"{what} was changed during the campaign.",
+        cause="it was built again, or another profile or image was saved",
         remedy="Begin again, with a new ledger; test a copy of it while you build.",
     )
 

@@ -22,7 +22,7 @@ from filelock import FileLock, Timeout
 from flasher.errors import ErrorCode, UsageError
 from flasher.files import JSON_MAX_SIZE, opened, parse_json
 from flasher.protocol.text import printable
-from flasher.simulate.campaign import CANARY_EVERY, Batch, Result, campaign_key
+from flasher.simulate.campaign import CANARY_EVERY, WALKS, Batch, Result, campaign_key
 from flasher.validation import NumberRange, json_keys
 
 if TYPE_CHECKING:
@@ -123,13 +123,18 @@ def _entry(path: Path, number: int, line: bytes, expected: str) -> Entry:
     code = campaign_key()  # the key begins with it
     is_same = campaign == expected if expected else str(campaign).startswith(code)
     if isinstance(campaign, str) and not is_same:
+        cause = "flasher or Python was changed since: the same seeds now mean other runs"
+        if campaign.startswith(code):
+            cause = "the device under test, its profile or an image was changed, or is another"
+            its, own = (_command(each) for each in (campaign, expected))
+            if its != own:
+                cause = f"it is of `{its}`, this is `{own}`"
         raise UsageError(
-            f"The ledger {printable(str(path))} was written by other code, so its results cannot be"
+            f"The ledger {printable(str(path))} is of another campaign, so its results cannot be"
             " added to those of this one.",
             where=f"line {number}: campaign {printable(campaign)[:40]}; this is {expected or code}",
-            cause="flasher, Python or the bootloader under test was changed since: the same seeds "
-            "now mean other plans",
-            remedy="Run the flasher and Python that wrote it, or begin with a new file.",
+            cause=cause,
+            remedy="Run the flasher, Python and device that it is of, or begin with a new file.",
         )
     try:
         entry = _adapter().validate_json(line, strict=True)
@@ -142,6 +147,10 @@ def _entry(path: Path, number: int, line: bytes, expected: str) -> Entry:
     if entry.result.campaign != entry.campaign or entry.result.runs != runs or not are_inside:
         raise _damaged(path, number, "its seeds are not those of its result")
     return entry
+
+
+def _command(campaign: str) -> str:
+    return "flasher conformance explore" if WALKS in campaign else "flasher simulate"
 
 
 def _damaged(path: Path, number: int, why: str) -> UsageError:

@@ -173,5 +173,9 @@ def fault_place(fault: str, phase: str) -> str:
     return f"fault: {fault}, {phase}"
 
 
+def step_place(phase: str, step: str) -> str:
+    return f"{phase}: {step}"
+
+
 def exit_place(code: int) -> str:
     return f"exit code: {int(code)}"

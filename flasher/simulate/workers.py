@@ -273,17 +273,19 @@ def _killed(batch: Batch, seed: int, exit_code: int | None) -> Result:
         how = f"ended its process: {signal.Signals(-exit_code).name}"
         if how.endswith("SIGPROF"):
             how = f"took more than {_RUN_S:g} s of CPU time"
-    plan = batch.plan_of(seed)
-    text = f"the run {how}"
+    text, plan, names = f"the run {how}", "", set[str]()
+    if batch.walks is None:
+        played = batch.plan_of(seed)
+        plan, names = str(played), {each.NAME for each in played.events} or {NO_FAULT}
     if batch.is_corpus:
-        found = Found(seed - CORPUS_SEEDS, KILLED, text, str(plan))
+        found = Found(seed - CORPUS_SEEDS, KILLED, text, plan)
         return Result(batch.campaign, corpus_runs=1, violations=(found,), violation_count=1)
     return Result(
         batch.campaign,
         runs=1,
         endings={"killed": 1},
-        tallies={name: Tally(runs=1) for name in {each.NAME for each in plan.events} or {NO_FAULT}},
-        violations=(Found(seed, KILLED, text, str(plan)),),
+        tallies={name: Tally(runs=1) for name in names},
+        violations=(Found(seed, KILLED, text, plan),),
         violation_count=1,
         digest=hashlib.sha256(f"{seed} {KILLED}".encode()).hexdigest()[:16],
     )

@@ -131,6 +131,7 @@ COMMAND_LINES: Final[tuple[tuple[str | Path, ...], ...]] = (
         ("mock", "-t", "bms", "-i", "virtual", "-c", "schema"),
         ("conformance", "serve", "-t", "bms", "--subject", BOOTLOADER, "-i", "virtual", "-c", "s"),
         ("conformance", "-t", "bms", "--mock", "--case", "RS-01", "--case", "EN-04"),
+        ("conformance", "explore", "-t", "bms", "--mock", "--runs", "1", "--jobs", "1"),
         ("conformance", "--list"),
         ("conformance", "profile"),
         ("station", "check", SAMPLES / "station" / "recipe.toml"),

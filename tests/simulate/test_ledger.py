@@ -161,7 +161,7 @@ def test_a_ledger_of_other_code_is_refused(tmp_path: Path) -> None:
     # Its results may have another form, too.
     path.write_text(json.dumps({**document, "campaign": "0123456789abcdef", "result": 1}) + "\n")
     for read in (lambda: merge([path]), lambda: Ledger(path, 0, RUNS)):
-        with pytest.raises(UsageError, match="written by other code") as refused:
+        with pytest.raises(UsageError, match="is of another campaign") as refused:
             read()
         assert f"0123456789abcdef; this is {campaign.campaign_key()}" in refused.value.where
         assert "begin with a new file" in refused.value.remedy

@@ -175,7 +175,7 @@ def test_ledgers_of_different_bootloaders_are_not_added_up(tmp_path: Path) -> No
         lambda: Ledger(paths[0], 0, 3, campaign_key(RIGHT, "wmc")),
     ]
     for read in readers:
-        with pytest.raises(UsageError, match="written by other code"):
+        with pytest.raises(UsageError, match="is of another campaign"):
             read()
 
 

@@ -19,6 +19,7 @@ from flasher.conformance.results import (
     ExploreResult,
     RunStopped,
     StepCoverage,
+    TraceEntry,
     Unsupported,
     WalkFinding,
 )
@@ -55,12 +56,14 @@ class Explorer:
         self._met: Counter[tuple[DevicePhase, str]] = Counter()
         self._steps = 0
         self._walks = 0
+        self.trace: tuple[TraceEntry, ...] = ()
+        """Frames of the last walk."""
 
     def explore(
-        self, steps: float, *, is_over: Callable[[], bool] = lambda: False
+        self, steps: float, *, is_over: Callable[[], bool] = lambda: False, shrinks: bool = True
     ) -> ExploreResult:
-        """Walk for `steps` steps, until `is_over` after a walk, or until a violation is found.
-        Raises BusError.
+        """Walk for `steps` steps, until `is_over` after a walk, or until a violation is found,
+        which is shrunk unless not `shrinks`. Raises BusError.
         """
         try:
             trouble = self._restore()
@@ -73,6 +76,8 @@ class Explorer:
                 found = self._walk([None] * length, taken, chance)
                 self._progress(self._steps)
                 if found is not None:
+                    if not shrinks:
+                        return self._result(self._finding(found, taken, taken))
                     finding = self._shrink(found, taken)
                     return self._result(finding, self._stop_reason() if self._stopped() else "")
                 if is_over():
@@ -81,8 +86,10 @@ class Explorer:
             return self._result(stopped=self._stop_reason())
         return self._result(stopped="it was stopped" if self._stopped() else "")
 
-    def replay(self, texts: Sequence[str]) -> ExploreResult:
-        """Take the steps of a finding. Raises UsageError and BusError."""
+    def replay(self, texts: Sequence[str], *, shrinks: bool = False) -> ExploreResult:
+        """Take the steps of a finding, and shrink it if `shrinks`. Raises UsageError and
+        BusError.
+        """
         steps = [parse_step(text) for text in texts]
         taken: list[WalkStep] = []
         try:
@@ -94,6 +101,8 @@ class Explorer:
             return self._result(stopped=self._stop_reason())
         if found is None:
             return self._result()
+        if shrinks:
+            return self._result(self._shrink(found, taken))
         return self._result(self._finding(found, taken, taken), self._restore_at_end())
 
     # -- one walk ----------------------------------------------------------------------------------
@@ -134,6 +143,8 @@ class Explorer:
             return Violation("crash", str(crashed)), bench
         except CaseLimitReached as reached:
             return Violation("time", str(reached)), bench
+        finally:
+            self.trace = bench.tester.trace
         return None
 
     def _restore(self) -> str:
