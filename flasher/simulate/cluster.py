@@ -76,7 +76,9 @@ class CampaignPlugin(WorkerPlugin):
 
     def play(self, batch: Batch) -> Result:
         with self._one_at_a_time:
-            result = self._process.run(batch, self._is_over.is_set)
+            result = Result(batch.campaign)
+            if not self._is_over.is_set():
+                result = self._process.run(batch, self._is_over.is_set)
         if self._is_over.is_set():
             self._end_process()
         return result
