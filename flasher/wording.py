@@ -44,8 +44,10 @@ _TEXTS: Final[dict[str, dict[str, str]]] = {
         "flash it again, or check after a power cycle what it runs",
         "no_application": "its application is erased, half written or not accepted: it stays in "
         "its bootloader until an image is flashed completely",
-        "unknown": "it has every byte of the image; whether it runs it is not known",
+        "unknown": "it acknowledged every byte of the image; whether it has and runs it now is not "
+        "known",
         "new": "it has the new image",
+        "other": "its application is, by its answers, not this image",
     },
     "Verdict": {
         "not_asked": "not asked for",

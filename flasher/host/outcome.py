@@ -42,11 +42,13 @@ class DeviceLeft(Enum):
     NO_APPLICATION = "no_application"
     UNKNOWN = "unknown"
     NEW = "new"
+    OTHER = "other"
+    """Its application answers as another one than the image."""
 
     @property
     def needs_rescue(self) -> bool:
         """True if the device has no application, or perhaps none."""
-        return self not in (DeviceLeft.UNTOUCHED, DeviceLeft.NEW)
+        return self not in (DeviceLeft.UNTOUCHED, DeviceLeft.NEW, DeviceLeft.OTHER)
 
 
 def with_device_state(remedy: str, left: DeviceLeft) -> Text:

@@ -70,8 +70,11 @@ _LEFT: Final = {
     Verdict.NO_ANSWER: DeviceLeft.UNKNOWN,
     Verdict.IN_BOOTLOADER: DeviceLeft.NO_APPLICATION,
     Verdict.TWO_DEVICES: DeviceLeft.UNKNOWN,
+    Verdict.SECOND_TOOL: DeviceLeft.UNKNOWN,
+    Verdict.VERSION_OTHER: DeviceLeft.OTHER,
+    Verdict.MEMORY_OTHER: DeviceLeft.OTHER,
 }
-"""State of the device after verdicts that leave open whether it runs the image."""
+"""State of the device after verdicts that do not confirm that it runs the image."""
 _JOINED_BYTES: Final = 16
 GOOD: Final = frozenset(
     {Verdict.NOT_ASKED, Verdict.VERSION_RIGHT, Verdict.VERSION_UNJUDGED, Verdict.MEMORY_RIGHT}

@@ -289,12 +289,12 @@ def _judge_contents(facts: Facts, reported: Reported) -> Iterator[Violation]:
     is_refused = reported.left is DeviceLeft.NO_APPLICATION and content == "new"
     if is_refused and len(contents) == 1 and not _has(facts.plan, _LIES_AT_THE_END):
         yield Violation("DISHONEST", "no application is reported, and the device has the new one")
-    # Another tool may erase a device that was complete, while its version is asked. Its commands
-    # are those of this tool: an adapter of unknown kind may be returning its own.
-    is_others = reported.left is DeviceLeft.NEW and _has(facts.plan, (plans.Tool,))
     has_lost = content == "none" != facts.before
-    if not (reported.needs_rescue or reported.is_ok or is_others) and has_lost:
+    if not (reported.needs_rescue or reported.is_ok) and has_lost:
         yield Violation("DISHONEST", "no need of rescue, and the device has no application")
+    is_claimed = reported.left is DeviceLeft.NEW and not (reported.is_ok or is_unseen)
+    if is_claimed and content != "new":
+        yield Violation("DISHONEST", f"the new image is reported, and the device has {content}")
     if reported.left is DeviceLeft.UNTOUCHED and content != facts.before:
         yield Violation("DISHONEST", f"untouched, and the device has {content}")
 

@@ -189,7 +189,7 @@ STAGES = [
     (Phase.BOOT, "this run erased nothing", False),
     (Phase.UPDATE, "it received the command to erase its application", True),
     (Phase.TRANSFER, "its application is erased, half written or not accepted", True),
-    (Phase.END, "it has every byte of the image", True),
+    (Phase.END, "it acknowledged every byte of the image", True),
 ]
 
 

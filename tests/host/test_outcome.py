@@ -18,6 +18,7 @@ from flasher.host.outcome import (
 )
 from flasher.host.table import Ending
 from flasher.host.verify import (
+    GOOD,
     Level,
     Verdict,
     Verification,
@@ -188,8 +189,16 @@ def test_what_ends_before_the_start_has_no_figures_but_its_time() -> None:
 
 
 @each("left", list(DeviceLeft))
-def test_a_device_needs_rescue_unless_it_is_untouched_or_has_the_image(left: DeviceLeft) -> None:
-    assert left.needs_rescue is (left not in (DeviceLeft.UNTOUCHED, DeviceLeft.NEW))
+def test_a_device_needs_rescue_unless_it_is_untouched_or_runs_an_application(
+    left: DeviceLeft,
+) -> None:
+    has_application = (DeviceLeft.UNTOUCHED, DeviceLeft.NEW, DeviceLeft.OTHER)
+    assert left.needs_rescue is (left not in has_application)
+
+
+@each("verdict", [each for each in Verdict if each not in GOOD and each is not Verdict.INTERRUPTED])
+def test_a_bad_verdict_does_not_claim_that_the_device_has_the_image(verdict: Verdict) -> None:
+    assert Verification(Level.VERSION, verdict).device_left is not DeviceLeft.NEW
 
 
 # -- verification ---------------------------------------------------------------------------------
@@ -203,7 +212,7 @@ def test_a_device_needs_rescue_unless_it_is_untouched_or_has_the_image(left: Dev
         (Verdict.IN_BOOTLOADER, ExitCode.VERIFICATION, ErrorCode.IN_BOOTLOADER, True),
         (Verdict.MEMORY_OTHER, ExitCode.VERIFICATION, ErrorCode.VERIFICATION, False),
         (Verdict.TWO_DEVICES, ExitCode.WRONG_DEVICE, ErrorCode.TWO_DEVICES, True),
-        (Verdict.SECOND_TOOL, ExitCode.BUS, ErrorCode.SECOND_TOOL, False),
+        (Verdict.SECOND_TOOL, ExitCode.BUS, ErrorCode.SECOND_TOOL, True),
         (Verdict.INTERRUPTED, ExitCode.INTERRUPTED, None, False),
     ],
 )

@@ -110,7 +110,7 @@ def test_a_second_tool_ends_the_session_in_every_stage_and_not_one_frame_more_is
         assert result.outcome.device_left is DeviceLeft.UNTOUCHED
     if phase == VERIFICATION:
         assert "completed, but a second tool speaks" in error.what
-        assert wording(DeviceLeft.NEW) in error.remedy
+        assert wording(DeviceLeft.UNKNOWN) in error.remedy
 
 
 def test_a_second_tool_cuts_a_message_short_that_was_finished_for_a_clean_end() -> None:

@@ -175,8 +175,7 @@ _LEFT: Final = {
     DeviceLeft.UNTOUCHED: "nothing was erased",
     DeviceLeft.PERHAPS_ERASED: "its application is perhaps erased",
     DeviceLeft.NO_APPLICATION: "it has no application now",
-    DeviceLeft.UNKNOWN: "it has every byte, what it runs is not known",
-    DeviceLeft.NEW: "it has the new image",
+    DeviceLeft.UNKNOWN: "it took every byte, what it runs is not known",
 }
 
 
@@ -186,9 +185,8 @@ def verdict_of(result: Result, checks: Iterable[CheckMade], took_s: float) -> Cl
     took = f"  {took_s:.1f} s"
     error = result.error()
     if error is not None:
-        is_new = outcome.device_left is DeviceLeft.NEW
-        left = "" if is_new else f"; {_LEFT[outcome.device_left]}"
-        return failed(error, left + took)
+        left = _LEFT.get(outcome.device_left)
+        return failed(error, f"; {left}{took}" if left else took)
     if not result.ok:
         return ClosingLine("NOTHING TO DO", f"{node}: {outcome.detail}{took}", "green")
     was = f", was {result.previous_version}" if result.previous_version else ""
