@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import click
 
@@ -26,11 +26,11 @@ from flasher.cli.stop import stop_on_signal
 from flasher.conformance.results import LINE_JOINT
 from flasher.errors import ExitCode
 from flasher.protocol.text import printable
-from flasher.simulate.campaign import NO_FAULT, Batch, Found, Result, Tally, share
-from flasher.simulate.ledger import Ledger
-from flasher.simulate.oracle import Violation
-from flasher.simulate.workers import KILLED, RunBatch
-from flasher.simulate.workers import run as run_in_processes
+
+if TYPE_CHECKING:
+    from flasher.simulate.campaign import Batch, Found, Result, Tally
+    from flasher.simulate.oracle import Violation
+    from flasher.simulate.workers import RunBatch
 
 _RUNS: Final = 1000
 _COLUMNS: Final = 79
@@ -82,6 +82,8 @@ class CampaignOptions:
 
     def part(self, batches: Iterable[Batch]) -> Iterable[Batch]:
         """Return the batches of the shard."""
+        from flasher.simulate.campaign import share  # noqa: PLC0415  for campaigns only
+
         return batches if self.shard is None else share(batches, *self.shard)
 
 
@@ -99,6 +101,12 @@ def run_campaign(
     """Run the batches that the ledger lacks, and print the rate. Returns the sum with the first
     violation `shrunk`, and whether the user stopped it.
     """
+    # Commands that run no campaign load this module too.
+    from flasher.simulate.campaign import Result  # noqa: PLC0415
+    from flasher.simulate.ledger import Ledger  # noqa: PLC0415
+    from flasher.simulate.workers import KILLED  # noqa: PLC0415
+    from flasher.simulate.workers import run as run_in_processes  # noqa: PLC0415
+
     began_s = time.perf_counter()
     total, most = Result(key), chosen.most
     with (
@@ -244,6 +252,8 @@ def _rows(tallies: Mapping[str, Tally]) -> Iterator[Sequence[str]]:
 
 def in_order(tallies: Mapping[str, Tally]) -> Sequence[tuple[str, Tally]]:
     """Return tallies by the name of the fault; runs without a fault come first."""
+    from flasher.simulate.campaign import NO_FAULT  # noqa: PLC0415  as above
+
     return sorted(tallies.items(), key=lambda each: each[0] != NO_FAULT)
 
 

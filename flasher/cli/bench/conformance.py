@@ -176,12 +176,21 @@ class HeaderDocument:
     files: list[str]
 
 
-DOCUMENTS: Final = (
+_DOCUMENTS: Final = (
     ConformanceDocument, CaseListDocument, Difference, SideBySide, ProfileKeysDocument,
     HeaderDocument,
     *conformance_explore.DOCUMENTS, *conformance_init.DOCUMENTS, *conformance_serve.DOCUMENTS,
     *conformance_replay.DOCUMENTS,
 )  # fmt: skip
+
+
+def __getattr__(name: str) -> tuple[type, ...]:
+    """The types of the `--json` documents, for the schema: that of campaigns takes long to load."""
+    if name != "DOCUMENTS":
+        raise AttributeError(name)
+    from flasher.simulate.campaign import Result  # noqa: PLC0415
+
+    return (*_DOCUMENTS, Result)
 
 
 # -- a run -----------------------------------------------------------------------------------------

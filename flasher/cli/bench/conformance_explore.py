@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from math import inf
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import click
 
@@ -40,7 +40,9 @@ from flasher.conformance.bench_options import BenchOptions, open_bench
 from flasher.conformance.results import ExploreResult
 from flasher.errors import ExitCode, UsageError
 from flasher.protocol.text import printable
-from flasher.simulate.campaign import Found, Result
+
+if TYPE_CHECKING:
+    from flasher.simulate.campaign import Found
 
 _EXAMPLES: Final = """\
 examples:
@@ -72,7 +74,7 @@ _REPLACED: Final = frozenset(
 )
 
 
-DOCUMENTS: Final = (ExploreResult, Result)
+DOCUMENTS: Final = (ExploreResult,)
 
 
 @command(
