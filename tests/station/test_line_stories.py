@@ -9,7 +9,9 @@ import re
 import sys
 from collections.abc import Callable
 from hashlib import sha256
+from itertools import count, islice
 from pathlib import Path
+from random import Random
 from subprocess import run
 from typing import Final
 
@@ -28,6 +30,7 @@ from flasher.station.unit_target import StepFailedError
 from tests.campaigns import line_world
 from tests.campaigns.line_bugs import read_bugs
 from tests.campaigns.line_world import undetectable
+from tests.campaigns.line_world.draw import setup_of
 from tests.campaigns.line_world.play import Played, draw, play, shrink
 from tests.campaigns.line_world.promises import Violation
 from tests.campaigns.line_world.stories import CLAUSES, Story
@@ -514,6 +517,14 @@ def test_a_drawn_story_has_no_violation(seed: int) -> None:
     """The first seeds that there are: nobody has chosen them."""
     played = draw(seed, SAMPLE_ACTS)
     assert not played.kind, f"{played.text}\n  {played.story}"
+
+
+def test_lines_without_numbers_are_drawn_an_exchange_in_an_outage() -> None:
+    """Ten stories find the mistake that shows in such an exchange alone."""
+    bug = next(each for each in read_bugs() if each.name == "green-over-the-next")
+    seeds = (seed for seed in count() if setup_of(Random(seed)).line.recipe == "plain")
+    with swapped(bug.codes()):
+        assert any(draw(seed, SAMPLE_ACTS).kind == bug.kind for seed in islice(seeds, 10))
 
 
 _LOG_HASH: Final = re.compile(r"log_sha256='\w+'")

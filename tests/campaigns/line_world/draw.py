@@ -23,6 +23,8 @@ _RECIPES: Final = {"writes": 10, "plain": 5, "held": 2, "bicycle": 2, "wmc": 2, 
 _NUMBERS: Final = {"none": 5, "empty": 2.5, "maker": 4, "own": 2, "other": 1.5}
 _NUMBERLESS: Final = ("empty", "new")
 """Number and application of a unit that runs the line's firmware, and reports no number."""
+_UNTOLD: Final = ("none", "empty")
+"""Numbers of units that nobody can tell from each other while the line writes none."""
 _GAPS_S: Final = (HAND_S, 0.3, 0.3, 0.5, 1.0, 3.5)
 """From pulling a unit to putting another one in."""
 _AFTER_FLASH: Final = (StepName.WRITE, StepName.RESTART, StepName.VERIFY)
@@ -107,9 +109,10 @@ class Teller:
                 scenes += 3 * [self._scan_another_number]
             if recipe == "writes" and {"maker", "empty"} <= numbers:
                 scenes += 6 * [self._exchange_for_numberless]
-            if recipe == "plain":
-                scenes += 4 * [self._go_on_in_an_outage]
-            for scene in self.chance.sample(scenes, 4):
+            chosen = self.chance.sample(scenes, 4)
+            if recipe == "plain":  # first: a unit that is left in its socket prevents it
+                chosen[0] = self._go_on_in_an_outage
+            for scene in chosen:
                 yield from scene(self.chance.choice(people))
                 yield 3.0, None
 
@@ -397,7 +400,8 @@ class Teller:
 
     def _go_on_in_an_outage(self, name: str) -> Iterator[Step]:
         """A socket stops to work after a PASS, and somebody goes on with the next unit there."""
-        for bay in (yield from self._bring(2)):
+        bays = yield from self._bring(2)
+        for bay in sorted(bays, key=lambda each: not self._is_untold(self._number(each))):
             unit = self._number(bay)
             yield self._pause(), stories.Card(by=name, unit=unit)
             yield self._pause(), stories.Label(by=name, unit=unit)
@@ -438,10 +442,17 @@ class Teller:
         if bay.unit is not None:
             yield from self._put_another(bay)
 
-    def _put_another(self, bay: Bay) -> Iterator[Step]:
+    def _is_untold(self, number: int) -> bool:
+        unit = self._setup(number)
+        return unit.number in _UNTOLD and unit.application != "none"
+
+    def _put_another(self, bay: Bay, *, is_untold: bool = False) -> Iterator[Step]:
+        """`is_untold`: one that cannot be told from it, if there is one."""
         before = self._number(bay)
         yield 0.0, stories.Pull(unit=before)
-        others = [self._setup(each) for each in self._on_table() if each != before]
+        on_table = [each for each in self._on_table() if each != before]
+        untold = [each for each in on_table if is_untold and self._is_untold(each)]
+        others = [self._setup(each) for each in untold or on_table]
         unit = before
         if others and self.chance.random() < 0.9:
             unit = self._another(self._setup(before), others).label
@@ -552,4 +563,4 @@ class Teller:
             yield 1.3, stories.KillWorker(socket=bay.name)
             yield 2.3, stories.KillWorker(socket=bay.name)
         if bay.unit is not None:
-            yield from self._put_another(bay)
+            yield from self._put_another(bay, is_untold=self.chance.random() < 0.7)
