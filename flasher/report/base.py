@@ -95,6 +95,7 @@ def environment(loader: BaseLoader, translate: Translator) -> Environment:
     made.filters["counted"] = lambda number: translate.numbers(counted(number))
     made.filters["wording"] = lambda word: translate(wording(word))
     made.filters["percent"] = lambda share: translate.numbers(translate(percent(share)))
+    made.filters["share"] = lambda share: translate.numbers(f"{scale.share_percent(share):.1f} %")
     made.filters["fixed"] = lambda value, digits: translate.numbers(f"{value:.{digits}f}")
     made.filters["number"] = translate.numbers
     made.filters["translated"] = translate

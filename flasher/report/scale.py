@@ -160,6 +160,11 @@ def slices(count: int, most: int) -> list[tuple[int, int]]:
     return [(count * part // parts, count * (part + 1) // parts) for part in range(parts)]
 
 
+def share_percent(share: float) -> float:
+    """Convert a share from 0 to 1 to percent, rounded down to one decimal: 100 only for 1."""
+    return math.floor(share * 1000 + _ROUNDING) / 10
+
+
 def duration_text(seconds: float | None) -> str:
     """Format a duration with three digits and a unit: 870 µs, 3.12 ms, 41.3 s, 2 min 05 s."""
     if seconds is None:

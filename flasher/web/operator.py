@@ -21,6 +21,7 @@ from starlette.routing import BaseRoute, Route
 from flasher.files import parse_json
 from flasher.i18n import text
 from flasher.protocol.text import printable
+from flasher.report.scale import share_percent
 from flasher.station.board import Board, Replies, Row, shown
 from flasher.station.events import (
     LineStopped,
@@ -122,7 +123,7 @@ class ScreenHeader:
             "shift": _counted(self.output.shift, translate),
             "first": "-"
             if self.output.first_pass_share is None
-            else translate.numbers(f"{int(self.output.first_pass_share * 1000) / 10:g} %"),
+            else translate.numbers(f"{share_percent(self.output.first_pass_share):g} %"),
             "causes": [f"{code} {count}" for code, count in self.output.causes],
             "health": [
                 {

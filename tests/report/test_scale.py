@@ -12,6 +12,7 @@ from flasher.report.scale import (
     linear_ticks,
     log_ticks,
     nice_step,
+    share_percent,
     slices,
     wants_log,
     whole_ticks,
@@ -173,3 +174,13 @@ def test_slices_are_all_of_it_in_nearly_equal_parts(count: int, most: int) -> No
 )
 def test_times_have_three_figures_and_a_unit(seconds: float | None, text: str) -> None:
     assert duration_text(seconds) == text
+
+
+@each("whole", [1, 7, 34, 1000, 99_999])
+def test_only_a_whole_share_is_100_percent(whole: int) -> None:
+    assert share_percent(whole / whole) == 100
+    assert share_percent((whole - 1) / whole) < 100
+    assert share_percent(29 / 34) == 85.2
+    assert [share_percent(tenths / 1000) for tenths in range(1001)] == [
+        tenths / 10 for tenths in range(1001)
+    ]

@@ -21,6 +21,7 @@ from rich.text import Text
 from flasher.cli.documents import to_json
 from flasher.cli.output import Output, counted, duration
 from flasher.protocol.text import printable
+from flasher.report.scale import share_percent
 from flasher.station import events
 from flasher.station.board import NO_BADGES, Board, Row, device_event_text
 from flasher.station.events import LineStopped, SocketState, StationEvent
@@ -240,10 +241,7 @@ def _cut(line: str, style: str = "") -> Text:
 
 
 def percent(share: float | None) -> str:
-    """Format a share from 0 to 1 as a percentage, rounded down: 100 % only for 1."""
-    if share is None:
-        return "-"
-    return f"{int(share * 1000) / 10:g} %"
+    return "-" if share is None else f"{share_percent(share):g} %"
 
 
 def figures_line(figures: Figures) -> str:
