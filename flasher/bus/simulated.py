@@ -192,6 +192,31 @@ class SimulatedBus:
         if faults.due_at < inf:
             self._report_faults()
 
+    def advance_message(self, limit: float) -> None:
+        """Advance to the next event and, when that is a frame of the only host, through the frames
+        that it queued after it, until a device is due: faster than one call for each.
+        """
+        self.advance(limit)
+        sender, *others = senders = self._hosts
+        faults, outbox = self.faults, sender.outbox
+        if others or faults.due_at < inf or not faults.takes_part or sender.tx_errors:
+            return
+        while outbox and self._delivered_at is not None:
+            queued_at, frame = outbox[0]
+            taken_s = frame_bits(frame) / self._bitrate_bps
+            ends_at = max(self._sending_ends_at, queued_at) + taken_s
+            if ends_at > limit:
+                return
+            for device in self._devices:
+                wanted = device.engine.deadline()
+                if device.outbox or device.on_event or (wanted is not None and wanted < ends_at):
+                    return
+            outbox.popleft()
+            self._sending_ends_at = ends_at
+            self.busy_s += taken_s
+            self.clock.wait_until(ends_at)
+            self._deliver(senders, frame)
+
     def _report_faults(self) -> None:
         """Report the faults of the adapter that are due."""
         now = self.clock.now()

@@ -61,7 +61,7 @@ class SimulatedPort:
             self._receives_until = deadline
             try:
                 while not arrived and self.now() < deadline:
-                    self.bus.advance(deadline)
+                    self.bus.advance_message(deadline)
                     if not arrived:
                         self._take_reports()
             except FlasherError as error:

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Final
 
 import pytest
 
+from flasher.bus.simulated import SimulatedBus
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import CASES, HOST_CASES, NOT_IMPLEMENTED, Requirement, Selection
 from flasher.conformance.mock import MockSubject
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.reports import completed, to_bytes
-from flasher.conformance.results import CaseVerdict, CheckOutcome, Unsupported
+from flasher.conformance.results import CaseVerdict, CheckOutcome, RunReport, Unsupported
 from flasher.conformance.runner import SuiteOptions, run
+from flasher.conformance.simulated import SimulatedPort
 from flasher.conformance.wire import RawFrame
 from flasher.errors import UsageError
 from flasher.mock.model import MockDevice
 from flasher.mock.store import AREA_START
+from flasher.protocol.frame import Frame
 from tests.loops import each
 
 from .bench import (
@@ -426,6 +429,31 @@ def test_the_same_seed_gives_the_same_report_and_chance_differs_by_case_and_repe
         return run(subject(), PROFILE, selection=Selection(cases=("UP-01",)), options=options)
 
     assert twice("7") == twice("7")
+
+
+def test_a_message_that_is_delivered_in_one_go_takes_the_same_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """And each answer and frame of another node: as if its frames were delivered one by one."""
+    cases = ("TX-02", "PW-02")  # also power cuts
+    trace: list[tuple[object, float]] = []
+    record = SimulatedPort._record
+
+    def noted(port: SimulatedPort, frame: Frame, at: float) -> Sequence[Frame]:
+        trace.append((frame, at))
+        return record(port, frame, at)
+
+    monkeypatch.setattr(SimulatedPort, "_record", noted)
+
+    def judged() -> tuple[RunReport, list[tuple[object, float]]]:
+        trace.clear()
+        device = MockSubject("bms", others=[Babbler(0.017)])
+        return run(device, PROFILE, selection=Selection(cases=cases)), [*trace]
+
+    in_one_go = judged()
+    monkeypatch.setattr(SimulatedBus, "advance_message", SimulatedBus.advance)
+    assert judged() == in_one_go
+    assert {result.verdict for result in in_one_go[0].results} == {CaseVerdict.PASS}
 
 
 def test_a_case_is_repeated_with_a_seed_of_its_own() -> None:
