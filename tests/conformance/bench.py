@@ -12,7 +12,7 @@ from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import CASES, Case, Requirement, Selection
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, device_maker, profile_of_mock
 from flasher.conformance.profile import ConformanceProfile, Value
-from flasher.conformance.results import CaseResult, CaseVerdict, RunReport
+from flasher.conformance.results import CaseResult, CaseVerdict, InitResult, RunReport
 from flasher.conformance.runner import RunObserver, SuiteOptions, run
 from flasher.conformance.subject import Subject
 from flasher.mock.model import MockDevice
@@ -20,6 +20,7 @@ from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
 
 PROFILE = profile_of_mock()
+NOTHING_STATED = ConformanceProfile()
 
 
 class DeafDevice(MockDevice):
@@ -153,6 +154,22 @@ def run_case(
         del CASES["FR-00"]
 
 
+def questions(*keys: str) -> list[tuple[init.Question, tuple[str, ...]]]:
+    """The questions of `init` that answer these keys."""
+    return [each for each in init.QUESTIONS if not {*keys}.isdisjoint(each[1])]
+
+
+def interview(
+    subject: Subject, *keys: str, start: ConformanceProfile = NOTHING_STATED
+) -> InitResult:
+    """What `init` finds by the questions of these keys alone."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(init, "QUESTIONS", questions(*keys))
+        found = init.ask_device(subject, start)
+    assert found.stopped == ""
+    return found
+
+
 def answers(
     subject: Subject, wanted: Collection[str], given: Mapping[str, Value]
 ) -> dict[str, Value | None]:
@@ -160,11 +177,7 @@ def answers(
     start = {key: value for key, value in given.items() if key not in wanted}
     if "device.largest_image_bytes" in wanted:  # it would know the most that could be
         start.pop("device.application_bytes", None)
-    asked = [each for each in init.QUESTIONS if not {*wanted}.isdisjoint(each[1])]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(init, "QUESTIONS", asked)
-        found = init.ask_device(subject, ConformanceProfile(start))
-    assert found.stopped == ""
+    found = interview(subject, *wanted, start=ConformanceProfile(start))
     return {one.key: one.value for one in found.answers if one.key in wanted}
 
 

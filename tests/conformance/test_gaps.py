@@ -87,7 +87,8 @@ def check_full_bench(cases: Sequence[str]) -> None:
     judged_by = profile_of_mock(subject.device.profile)
     selection = Selection(cases=tuple(cases))
     report = run(subject, judged_by, selection=selection, options=SuiteOptions(upgrades=4))
-    assert report.gaps == ()
+    foreseen = bench_gaps(missing_requirements(subject, judged_by), {*CASES} - {*NOT_OF_MODEL})
+    assert report.gaps == foreseen == ()
     count = len(cases)
     assert report.in_full == f"{count} of {count} passes were judged in full"
 
@@ -100,7 +101,8 @@ def test_what_a_bare_bench_cannot_judge_is_said_beforehand(target: str, address:
 
 @pytest.mark.slow
 def test_on_a_bench_with_everything_every_pass_is_in_full() -> None:
-    check_full_bench(SHORT)
+    """These; `test_the_mock_passes` of each other group wants all of its cases to."""
+    check_full_bench([case_id for case_id in SHORT if case_id.startswith(("BR", "SO", "SP"))])
 
 
 def test_more_of_a_bench_judges_more() -> None:

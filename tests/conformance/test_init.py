@@ -12,6 +12,7 @@ from typing import Any, Final, get_args, get_type_hints
 
 import pytest
 
+from flasher.conformance import init
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import CASES, QUICK, Selection
 from flasher.conformance.dut.subject import open_subject
@@ -44,7 +45,7 @@ from flasher.protocol.timing import DEFAULT_TIMINGS
 from tests.campaigns.profiles import AREA_BYTES, faults
 from tests.campaigns.right_devices import answers_late, right_device
 from tests.cli.conftest import Flasher
-from tests.conformance.bench import DeafDevice, answers
+from tests.conformance.bench import DeafDevice, answers, interview, questions
 from tests.conformance.test_other_device import (
     IMAGE,
     BurstAnnouncer,
@@ -72,6 +73,9 @@ CHOICES: Final = {
 }
 """Key of the profile to the option of the device model."""
 OTHER_WORDS: Final = {"general_feedback": "feedback", ("up_08", "ignored"): "rejected"}
+_KEYS: Final = tuple(profile_keys())
+_NEEDED: Final = ("device.versions", "limits.window_s", "up_08")
+"""Answers that other questions need."""
 OPEN: Final = {"en_04", "limits.refused_s", "limits.silence_s"} | {
     "device.application_bytes",
     "device.application_address",
@@ -141,9 +145,14 @@ class Confirming(MockDevice):
 
 
 class Witness(MockDevice):
-    """Records every completed image."""
+    """Records every completed image, and counts how often it is erased."""
 
     completed: set[bytes]
+    erased = 0
+
+    def _erase(self, now: float) -> str:
+        self.erased += 1
+        return super()._erase(now)
 
     def _complete(self, now: float) -> str:
         self.completed.add(self.store.read(self._transfer.size_bytes))
@@ -258,23 +267,27 @@ def test_each_value_of_each_choice_of_the_device_model_is_seen(turn: int) -> Non
         ),
         (
             lambda: bench(LatePages("bms", capacity_bytes=3000)),
-            {"up_04_burst": "rejected", "device.buffer_bytes": 896},
+            {
+                "up_04_burst": "rejected",
+                "device.largest_image_bytes": 3000,
+                "device.buffer_bytes": 896,
+            },
         ),
     ],
 )
 def test_other_ways_are_seen(make: Callable[[], Subject], wanted: dict[str, Any]) -> None:
-    found = values(ask_device(make(), ConformanceProfile()))
+    found = values(interview(make(), *wanted, *_NEEDED))
     assert {key: found[key] for key in wanted} == wanted
 
 
 @pytest.mark.slow
 def test_no_limit_is_shorter_than_what_the_device_needs() -> None:
-    slow = values(ask_device(bench(SlowBursts("bms", capacity_bytes=3000)), ConformanceProfile()))
+    slow = values(interview(bench(SlowBursts("bms", capacity_bytes=3000)), "en_03", "rs_03"))
     assert slow["limits.ack_s"] > 3 * 0.4
     assert slow["limits.complete_s"] > 3 * 6.0
     assert slow["limits.first_version_s"] > 3 * 1.0
     erasing = mock(erase_time_s=0.1, transfer_timeout_s=12.5, window_s=0.321)
-    found = values(ask_device(erasing, ConformanceProfile()))
+    found = values(interview(erasing, *_NEEDED, "tx_12", "device.largest_image_bytes"))
     assert found["limits.erase_s"] > AREA_BYTES / 2048 * 0.1  # the largest image
     assert found["limits.pause_s"] == 12.5
     # As long as the document gives it: no image was refused.
@@ -284,22 +297,33 @@ def test_no_limit_is_shorter_than_what_the_device_needs() -> None:
 
 @pytest.mark.slow
 def test_acknowledged_bytes_that_are_not_written_are_seen_though_the_flash_holds_the_same() -> None:
-    paged = values(ask_device(bench(OldPages("bms", capacity_bytes=12288)), ConformanceProfile()))
+    paged = values(
+        interview(bench(OldPages("bms", capacity_bytes=12288)), *_NEEDED, "device.buffer_bytes")
+    )
     assert paged["device.buffer_bytes"] == 896
 
 
 @pytest.mark.slow
 @each(
-    "make",
+    "make, question",
     (
-        lambda: bench(SlowPages("bms", capacity_bytes=12288)),
-        lambda: mock(answers_late(Nak=0.2)),
-        lambda: mock(answers_late(Nak=0.2), bad_packet="silence", repeated_packet="nak_next"),
-        lambda: mock(answers_late(Nak=0.2), bad_packet="silence", older_packet="nak"),
+        (lambda: bench(SlowPages("bms", capacity_bytes=12288)), "device.buffer_bytes"),
+        (lambda: mock(answers_late(Nak=0.2)), "en_03"),
+        (
+            lambda: mock(answers_late(Nak=0.2), bad_packet="silence", repeated_packet="nak_next"),
+            "en_03",
+        ),
+        (
+            lambda: mock(answers_late(Nak=0.2), bad_packet="silence", older_packet="nak"),
+            "en_03",
+        ),
     ),
 )
-def test_the_limit_of_an_answer_holds_for_the_slowest_one(make: Callable[[], Subject]) -> None:
-    assert values(ask_device(make(), ConformanceProfile()))["limits.ack_s"] >= 0.6
+def test_the_limit_of_an_answer_holds_for_the_slowest_one(
+    make: Callable[[], Subject], question: str
+) -> None:
+    """Any one question that such an answer comes to is enough."""
+    assert values(interview(make(), question))["limits.ack_s"] >= 0.6
 
 
 @pytest.mark.slow
@@ -310,7 +334,8 @@ def test_the_longest_gap_in_a_packet_is_found() -> None:
         def __init__(self, *given: Any, **named: Any) -> None:
             super().__init__(*given, **{**named, "timings": timings})
 
-    assert values(ask_device(mock(Patient), ConformanceProfile()))["limits.inter_frame_s"] == 0.26
+    found = values(interview(mock(Patient), "tx_12", "limits.inter_frame_s"))
+    assert found["limits.inter_frame_s"] == 0.26
 
 
 @pytest.mark.slow
@@ -374,11 +399,11 @@ def test_the_suite_passes_by_the_profile_that_is_written() -> None:
     assert faults(11, Selection(quick=True)) == []
 
 
-def check_python_bootloader(cases: Sequence[str]) -> None:
-    """It passes these cases with the profile determined from its answers."""
+def check_python_bootloader(cases: Sequence[str], keys: Sequence[str] = _KEYS) -> None:
+    """It passes these cases with the profile determined from its answers about these keys."""
     what, start = "tests.peers.python_bootloader:PythonBootloader", ConformanceProfile()
     with open_subject(what, "bms", start, good_image=None, second_image=None) as (subject, _):
-        profile = ask_device(subject, start).profile(start)
+        profile = interview(subject, *keys).profile(start)
         report = run(subject, profile, selection=Selection(cases=tuple(cases)))
     assert profile.choice("up_05") == "each"
     assert profile.value("device.largest_image_bytes") == 0xF000
@@ -388,18 +413,22 @@ def check_python_bootloader(cases: Sequence[str]) -> None:
 @pytest.mark.slow
 @pytest.mark.no_cover
 def test_the_bootloader_of_others_passes_by_its_profile() -> None:
-    check_python_bootloader(("UP-05", "UP-08", "EN-02"))
+    keys = (*_NEEDED, "en_03", "up_05", "tx_12", "en_02", "device.largest_image_bytes")
+    check_python_bootloader(("UP-05", "UP-08", "EN-02"), keys)
 
 
 @pytest.mark.slow
-def test_only_good_images_are_completed_and_the_small_one_is_there_in_the_end() -> None:
-    """The times of the larger one are measured, too."""
-    subject = mock(Witness)
+def test_only_good_images_are_completed_as_often_as_the_user_is_told() -> None:
+    """The small one is there in the end; the times of the larger one are measured, too."""
+    subject, start = mock(Witness), ConformanceProfile()
     assert isinstance(subject.device, Witness)
     subject.device.completed = set()
-    values(ask_device(subject, ConformanceProfile()))
+    asked = ask_device(subject, start)
+    assert asked.stopped == ""
     assert subject.device.completed == {GOOD_IMAGE, subject.firmware.good}
     assert subject.device.stored_image == GOOD_IMAGE
+    run(subject, asked.profile(start), selection=Selection(quick=True))
+    assert pytest.approx(UPGRADES, rel=0.25) == subject.device.erased
 
 
 def test_a_device_that_is_not_there_is_told_and_nothing_is_asked() -> None:
@@ -445,26 +474,39 @@ def test_the_command_writes_a_profile_that_is_read_again(flasher: Flasher, tmp_p
     text = path.read_text(encoding="utf-8")
     assert f"# open: {NOT_ASKED['en_04']}" in text
     assert {f"# {passed}", f"# Margins: {MARGINS}.", f"# {unstated()}"} <= set(text.splitlines())
-    assert flasher("conformance", *model, "--profile", str(path), "--quick").code == 0
-    written = path.read_bytes()
+    by_file = ("--profile", str(path), "--case", "TX-02", "--case", "UP-04")
+    assert flasher("conformance", *model, *by_file).code == 0
+
+
+@pytest.mark.slow
+def test_a_file_that_is_there_is_written_with_force_alone(
+    flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "p.toml"
+    path.write_text("of another device")
+    model = ("-t", "bms", "--mock")
     again = flasher("conformance", "init", *model, "-o", str(path))
     assert again.code == 2
     assert "exists already" in again.err
-    assert path.read_bytes() == written
+    assert path.read_text() == "of another device"
+    monkeypatch.setattr(init, "QUESTIONS", questions("limits.window_s", "tx_02"))
     forced = flasher("--json", "conformance", "init", *model, "-o", str(path), "--force")
     assert forced.code == 0
     document = json.loads(forced.out)
     assert document["toml"] == path.read_text(encoding="utf-8")
     found = {one["key"]: one["value"] for one in document["answers"]}
     assert (found["tx_02"], found["en_04"]) == ("ack", None)
+    determined = {key: value for key, value in found.items() if value is not None}
+    assert load_profile(path).given == determined
     assert document["report"]["passed"]
 
 
 @pytest.mark.slow
 def test_what_does_not_pass_by_the_profile_is_beside_its_keys(
-    flasher: Flasher, tmp_path: Path
+    flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "p.toml"
+    monkeypatch.setattr(init, "QUESTIONS", questions("limits.window_s", "tx_01", "tx_02"))
     wrong = ("-t", "bms", "--mock", "--set", "application_area_bytes=34K", "--variant")
     ran = flasher("conformance", "init", *wrong, "no-crc-check", "-o", str(path))
     assert ran.code == 12
@@ -488,26 +530,12 @@ def test_no_file_is_written_when_the_quick_cases_are_broken_off(
         case.run(bench)
 
     monkeypatch.setitem(CASES, case.id, replace(case, run=interrupted))
+    monkeypatch.setattr(init, "QUESTIONS", questions("limits.window_s"))
     model = ("-t", "bms", "--mock", "--set", "application_area_bytes=34K")
     ran = flasher("conformance", "init", *model, "-o", str(path))
     assert ran.code == 130
     assert "no profile is written: the run was stopped" in ran.err
     assert not path.exists()
-
-
-@pytest.mark.slow
-def test_the_user_is_told_how_often_the_device_is_erased() -> None:
-    class Counting(MockDevice):
-        erased = 0
-
-        def _erase(self, now: float) -> str:
-            type(self).erased += 1
-            return super()._erase(now)
-
-    subject, start = mock(Counting), ConformanceProfile()
-    profile = ask_device(subject, start).profile(start)
-    run(subject, profile, selection=Selection(quick=True))
-    assert pytest.approx(UPGRADES, rel=0.25) == Counting.erased
 
 
 def test_no_file_is_written_for_a_device_that_does_not_answer(
