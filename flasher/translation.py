@@ -55,7 +55,7 @@ class _Entry(NamedTuple):
     """Sentence with values, and the longest part that each of its texts has."""
 
     template: str
-    pattern: re.Pattern[str]
+    regex: str
     landmark: str
 
 
@@ -137,7 +137,8 @@ class Translator(Formatter):
     def _matched(self, sentence: str, values: re.Pattern[str]) -> str:
         """Translate by the entry that matches with such values; "" without one."""
         for entry in self._entries:
-            found = entry.pattern.fullmatch(sentence) if entry.landmark in sentence else None
+            is_near = entry.landmark in sentence
+            found = _pattern(entry.regex).fullmatch(sentence) if is_near else None
             has_other_end = values is _WHOLE and sentence[-1:] == "." != entry.template[-1:]
             if found is None or has_other_end or not all(map(values.fullmatch, found.groups())):
                 continue
@@ -192,16 +193,21 @@ def _sentences(catalogue: gettext.NullTranslations) -> Iterator[tuple[str, str]]
 
 def _entries(catalogue: gettext.NullTranslations) -> Iterator[_Entry]:
     for template in getattr(catalogue, "_catalog", ()):
-        pattern, landmark, marks, names = "", "", 0, set[str]()
+        regex, landmark, marks, names = "", "", 0, set[str]()
         for literal, name, _, _ in Formatter().parse(template):
-            pattern += re.escape(literal)
+            regex += re.escape(literal)
             landmark = max(landmark, literal, key=len)
             marks += len(literal) - literal.count(" ")
             if name is not None:
-                pattern += f"(?P={name})" if name in names else f"(?P<{name}>.*?)"
+                regex += f"(?P={name})" if name in names else f"(?P<{name}>.*?)"
                 names.add(name)
         if names and marks >= _MARKS_MIN:
-            yield _Entry(template, re.compile(pattern, re.DOTALL), landmark)
+            yield _Entry(template, regex, landmark)
+
+
+@cache  # only entries whose landmark was read need theirs
+def _pattern(regex: str) -> re.Pattern[str]:
+    return re.compile(regex, re.DOTALL)
 
 
 @cache

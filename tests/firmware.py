@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import struct
+from functools import cache
+from io import StringIO
 from pathlib import Path
 from typing import Final
 
@@ -16,7 +18,14 @@ _SHORT_SIZE: Final = 4096
 
 def shorten(sample: Path, to: Path) -> None:
     """Write the beginning of a sample, with the texts in it, as .hex and .bin."""
+    for suffix, written in _shortened(sample).items():
+        Path(f"{to}{suffix}").write_bytes(written)
+
+
+@cache
+def _shortened(sample: Path) -> dict[str, bytes]:
     whole = IntelHex(f"{sample}.hex")
     short = whole[whole.minaddr() : whole.minaddr() + _SHORT_SIZE]
-    short.write_hex_file(f"{to}.hex")
-    short.tobinfile(f"{to}.bin")
+    lines = StringIO()
+    short.write_hex_file(lines)
+    return {".hex": lines.getvalue().encode(), ".bin": short.tobinstr()}
