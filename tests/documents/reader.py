@@ -45,8 +45,8 @@ class PageReader:
     """Runs the blocks of a page in their order; AssertionError where the page is wrong."""
 
     def __init__(self, folder: Path, *, patient: bool, shows_samples: bool = True) -> None:
-        """`patient` runs what is slow, too. A page that shows nothing of the samples is followed
-        with a short one of the BMS, unless one is patient.
+        """`patient` runs what is slow, too. A page that does not show the size of the sample of the
+        BMS is followed with a short one, unless one is patient.
         """
         self._folder = folder
         self._patient = patient

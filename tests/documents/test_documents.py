@@ -22,6 +22,9 @@ FOLLOWED = {
     if (found := list(blocks(path.read_text(encoding="utf-8"))))
 }
 
+SIZE = re.compile(rf"\b{(ROOT / 'firmware_samples' / 'bms.bin').stat().st_size}\b")
+"""Of the sample, as a page shows it that needs the whole of it."""
+
 
 def follow(found: list[Block], folder: Path, *, patient: bool) -> None:
     """Do what a page says. Nothing waits for the device model."""
@@ -39,9 +42,8 @@ def follow(found: list[Block], folder: Path, *, patient: bool) -> None:
         ):
             patch.setenv(name, str(folder / name.lower()))
         patch.setenv("KEY_WORDS", "the passphrase that pages name")
-        images = ("bms.hex", "YOUR_IMAGE.hex")
         shown = any(
-            block.language == "console" and any(image in block.text for image in images)
+            block.language == "console" and SIZE.search(block.text.replace(",", ""))
             for block in found
         )
         reader = PageReader(folder, patient=patient, shows_samples=shown)
