@@ -166,7 +166,7 @@ def _frames_of_database(source: BufferedIOBase, path: Path) -> Iterator[tuple[fl
             left -= 1
             if left < 0:
                 raise UnfitError("it claims more rows than fit into its size")
-            data = b"" if held is None and remote else held
+            data = b"" if remote else held
             kinds = (
                 isinstance(at_s, int | float),
                 isinstance(can_id, int),

@@ -182,6 +182,20 @@ def test_a_database_of_python_can_is_read_to_its_last_row(tmp_path: Path) -> Non
     assert read == [1.7e9 + number / 1000 for number in written if number % 4 != 3]
 
 
+@pytest.mark.parametrize("error", [0, 1])
+def test_a_remote_frame_of_a_database_has_no_data_even_if_its_row_has(
+    tmp_path: Path, error: int
+) -> None:
+    path = tmp_path / "trace.db"
+    can.SqliteWriter(path).stop()
+    with closing(sqlite3.connect(path)) as connection, connection:
+        row = (1.0, 0x752, 0, 1, error, 8, bytes(8))
+        connection.execute("INSERT INTO messages VALUES (?, ?, ?, ?, ?, ?, ?)", row)
+    assert [frame for _, frame in read_trace(path)] == [
+        Frame(0x752, b"", is_remote=True, is_error=bool(error))
+    ]
+
+
 def test_a_format_whose_package_is_missing_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
