@@ -7,13 +7,14 @@ limit.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, Final
 
 import pytest
 
 from flasher.conformance.catalogue import Selection
 from flasher.conformance.explore import Explorer
-from flasher.conformance.mock import MOCK_PROFILE, profile_of_mock
+from flasher.conformance.firmware import GOOD, SECOND, Firmware
+from flasher.conformance.mock import MOCK_PROFILE, model_image, profile_of_mock
 from flasher.conformance.profile import ConformanceProfile, Value
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
@@ -46,16 +47,26 @@ from tests.campaigns.right_devices import (
 from tests.conformance.bench import answers, subject
 from tests.loops import each
 
+_SMALL_FIRMWARE: Final = dataclasses.replace(MOCK_PROFILE, page_size_bytes=1024)
+"""Images of whole sectors have half the usual size."""
+
 
 def blamed(
     *case_ids: str,
     kind: type[MockDevice] = MockDevice,
     device: DeviceProfile = MOCK_PROFILE,
     given: dict[str, Value] | None = None,
+    images: tuple[bytes, bytes] | None = None,
 ) -> list[str]:
-    """Failures of these cases on a device, judged by its own profile and `given`."""
+    """Failures of these cases on a device, judged by its own profile and `given`, with these
+    `images`, a good and a second one.
+    """
     profile = ConformanceProfile({**profile_of_mock(device).given, **(given or {})})
-    report = run(subject(kind, device), profile, selection=Selection(cases=case_ids))
+    made = subject(kind, device)
+    if images is not None:
+        made.good_image, made.second_image = images
+        made.firmware = Firmware(*images)
+    report = run(made, profile, selection=Selection(cases=case_ids))
     found = [
         f"{result.case_id} {result.verdict.value}: {result.reason}"
         for result in report.results
@@ -190,7 +201,7 @@ def test_a_restart_in_a_transfer_may_take_longer_than_a_pause(choice: str, pause
 
 @pytest.mark.slow
 def test_an_application_may_start_at_the_end_of_its_limit() -> None:
-    device = dataclasses.replace(MOCK_PROFILE, start_delay_s=4.99)
+    device = dataclasses.replace(_SMALL_FIRMWARE, start_delay_s=4.99)
     assert blamed("BR-01", "EN-01", "EN-02", "EN-07", device=device) == []
 
 
@@ -198,7 +209,7 @@ def test_an_application_may_start_at_the_end_of_its_limit() -> None:
 def test_an_update_command_in_the_burst_may_be_answered_by_nak() -> None:
     kind = type("Right", (RefusesInBurst, answers_late(Nak=0.3)), {})
     given: dict[str, Value] = {"up_04_burst": "rejected", "up_02": "nak"}
-    device = dataclasses.replace(MOCK_PROFILE, window_s=0.9)
+    device = dataclasses.replace(_SMALL_FIRMWARE, window_s=0.9)
     assert blamed("CR-04", "UP-02", "EN-01", "TX-13", kind=kind, device=device, given=given) == []
 
 
@@ -281,9 +292,16 @@ def test_a_dual_bank_device_may_keep_its_old_application(
     kind: type[MockDevice], old: str, case_ids: tuple[str, ...]
 ) -> None:
     device = dataclasses.replace(
-        MOCK_PROFILE, image_checksum="crc32", after_complete="restarts", transfer_timeout_s=3.0
+        _SMALL_FIRMWARE, image_checksum="crc32", after_complete="restarts", transfer_timeout_s=3.0
     )
     assert blamed(*case_ids, kind=kind, device=device, given={"rs_03_old": old}) == []
+
+
+_SMALL_PAGES: Final = dataclasses.replace(
+    MOCK_PROFILE, after_complete="restarts", page_size_bytes=256
+)
+_TWO_PAGES: Final = model_image(GOOD[0], 300), model_image(SECOND[0], 384)
+"""Power is cut in every frame and operation of an upgrade."""
 
 
 @pytest.mark.slow
@@ -291,8 +309,8 @@ def test_a_dual_bank_device_may_keep_its_old_application(
 def test_power_cuts_leave_a_dual_bank_device_its_old_or_new_application(
     kind: type[MockDevice],
 ) -> None:
-    device = dataclasses.replace(MOCK_PROFILE, after_complete="restarts", page_size_bytes=1024)
-    assert blamed("PW-01", "PW-02", kind=kind, device=device, given=_KEPT) == []
+    found = blamed("PW-01", "PW-02", kind=kind, device=_SMALL_PAGES, given=_KEPT, images=_TWO_PAGES)
+    assert found == []
 
 
 class _ForgetsCopy(CopiesImage):
@@ -339,8 +357,7 @@ class _ErasesJournal(KeepsJournal):
 def test_a_device_that_loses_an_image_to_a_power_cut_after_complete_fails(
     kind: type[MockDevice],
 ) -> None:
-    device = dataclasses.replace(MOCK_PROFILE, after_complete="restarts", page_size_bytes=1024)
-    (found,) = blamed("PW-01", kind=kind, device=device, given=_KEPT)
+    (found,) = blamed("PW-01", kind=kind, device=_SMALL_PAGES, given=_KEPT, images=_TWO_PAGES)
     assert "flash operation" in found
 
 
@@ -389,8 +406,8 @@ def test_walks_on_a_dual_bank_device_find_nothing(old: str) -> None:
 @each("target", ("bms", "wmc"))
 def test_an_application_may_take_its_time_to_listen(target: str) -> None:
     report = run(
-        subject(StartsSlowly, target=target),
-        profile_of_mock(),
+        subject(StartsSlowly, _SMALL_FIRMWARE, target),
+        profile_of_mock(_SMALL_FIRMWARE),
         selection=Selection(cases=("BR-01", "RS-01", "RS-03", "UP-02", "UP-03", "EN-01", "EN-07")),
     )
     assert [result.reason for result in report.results if result.verdict not in HELD] == []

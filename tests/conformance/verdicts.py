@@ -15,8 +15,10 @@ from flasher.conformance.profile import ConformanceProfile, Value
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import execute
 
-SMALL_AREA = {"application_area_bytes": 34 * 1024}
-"""272 packets: enough for all images up to 64 KiB, and quick to fill."""
+SMALL_AREA = {"application_area_bytes": 34 * 1024, "page_size_bytes": 1024}
+"""272 packets: enough for all images up to 64 KiB, and quick to fill; images of whole sectors have
+half the usual size.
+"""
 
 
 def verdicts(
