@@ -40,10 +40,12 @@ from flasher.conformance.wire import (
     RawFrame,
     Received,
     Reply,
+    joined,
 )
 from flasher.errors import UsageError
 
 _TRIES: Final = 80
+_RESETS_TRIED: Final = 3
 _BURST_S: Final = 0.002
 """Frames sent within this time belong to one message."""
 _AFTER_S: Final = 0.02
@@ -320,7 +322,7 @@ class _Exporter:
                 "profile states a choice that the model does not have, or their times matter",
             )
         stimuli = shrink(
-            stimuli,
+            self._since_reset(stimuli, demand),
             lambda fewer: fewer if fewer and self._shows(fewer, demand) else None,
             tries=_TRIES,
         )
@@ -328,6 +330,17 @@ class _Exporter:
         frames = sum(len(one.frames) for one in stimuli)
         code = self._code(heading, finding, stimuli, demand)
         return ExportedTest(code, len(stimuli), frames)
+
+    def _since_reset(self, stimuli: Sequence[Stimulus], demand: Demand) -> Sequence[Stimulus]:
+        """What follows one of the last resets, if that shows it: far fewer frames to shrink."""
+        reset = joined(self._encoder.reset())
+        begins = [
+            index
+            for index, one in enumerate(stimuli)
+            if joined(entry.frame for entry in one.frames) == reset
+        ]
+        latest = (stimuli[index:] for index in reversed(begins[-_RESETS_TRIED:]))
+        return next((fewer for fewer in latest if self._shows(fewer, demand)), stimuli)
 
     def _shows(self, stimuli: Sequence[Stimulus], demand: Demand) -> bool:
         # The model first: it needs no process, and does not meet most shorter sequences.
