@@ -14,7 +14,6 @@ from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import Selection
 from flasher.conformance.dut.process import BootloaderProcess
 from flasher.conformance.explore import Explorer
-from flasher.conformance.init import ask_device
 from flasher.conformance.init.answers import Trial
 from flasher.conformance.init.session import InitSession
 from flasher.conformance.init.transfer_questions import padded
@@ -27,7 +26,7 @@ from tests.campaigns.profiles import faults as profile_faults
 from tests.campaigns.right_c_devices import right_c_device
 from tests.campaigns.right_c_in_process import LoadedBootloader
 from tests.campaigns.right_devices import HELD, faults_of
-from tests.conformance.bench import answers
+from tests.conformance.bench import answers, interview
 from tests.loops import each
 
 pytestmark = [
@@ -192,19 +191,27 @@ def test_init_finds(seed: int, changed: dict[str, int], wanted: dict[str, Value 
 
 
 @each(
-    "seed, wanted",
+    "seed, wanted, earlier",
     (
         # It still writes packet 1 when packet 2 begins.
-        (11, {"limits.inter_frame_s": 0.16, "tx_01_lost_frame": "silence"}),
+        (
+            11,
+            {"limits.inter_frame_s": 0.16, "tx_01_lost_frame": "silence"},
+            ("device.versions", "en_03", "limits.window_s", "tx_12"),
+        ),
         # The larger image that the cases use is larger than any that it accepts.
-        (73, {"en_03": "starts", "device.largest_image_bytes": 5005}),
+        (
+            73,
+            {"en_03": "starts", "device.largest_image_bytes": 5005},
+            ("device.versions", "limits.window_s", "tx_12"),
+        ),
     ),
 )
 def test_init_finds_by_its_answers_to_earlier_questions(
-    seed: int, wanted: dict[str, Value]
+    seed: int, wanted: dict[str, Value], earlier: tuple[str, ...]
 ) -> None:
     with right_c_device(seed).subject() as subject:
-        asked = ask_device(subject, ConformanceProfile())
+        asked = interview(subject, *wanted, *earlier)
     found = {one.key: one.value for one in asked.answers}
     assert {key: found[key] for key in wanted} == wanted
 
@@ -249,7 +256,7 @@ def test_init_leaves_open_whether_end_of_transfer_erases_the_application_without
     choices = {**device.choices, "PAGE_BYTES": 8448, "PAUSE_US": 2_500_000}
     device = dataclasses.replace(device, choices=choices, is_bare=True)
     with device.subject() as subject:
-        asked = ask_device(subject, ConformanceProfile())
+        asked = interview(subject, "device.versions", "en_03", "tx_12", "tx_13", "rs_03_old")
     answer = next(one for one in asked.answers if one.key == "rs_03_old")
     assert answer.value is None
     assert answer.seen.endswith("can only be seen with power control")
