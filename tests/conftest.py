@@ -107,6 +107,22 @@ def plugins_of_python_can_are_found_once() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True, scope="session")
+def a_library_reads_the_same_sample_once() -> Iterator[None]:
+    """The second reading takes most of the time of loading a sample, which hundreds of tests do.
+    Short files, of tests of the reading itself, are read each time.
+    """
+    from flasher.image import records  # noqa: PLC0415  not where tests are handed out
+
+    read = records._by_intelhex
+    once = functools.lru_cache(64)(read)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            records, "_by_intelhex", lambda lines: (once if len(lines) > 10_000 else read)(lines)
+        )
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
 def files_elsewhere(tmp_path_factory: pytest.TempPathFactory) -> None:
     """For processes that a test starts too."""
     from flasher.cli.recording import BUNDLE_FOLDER  # noqa: PLC0415  not where tests are handed out
