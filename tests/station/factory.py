@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import sqlite3
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, date, datetime, timedelta
 from functools import cache
 from pathlib import Path
@@ -98,6 +98,27 @@ class FakeClock:
         self.seconds += seconds
 
 
+@dataclass(frozen=True)
+class _Grown:
+    """What a bench leaves: all files below its folder, its time, and how many traces it made."""
+
+    files: dict[str, bytes]
+    clock: FakeClock
+    traces: int
+
+
+@cache
+def _grown(grow: Callable[[Bench], object]) -> _Grown:
+    """Records that something was done to; done once, since it takes a while."""
+    with tempfile.TemporaryDirectory() as made:
+        bench = Bench(Path(made))
+        grow(bench)
+        bench.store.close()
+        files = [each for each in bench.folder.rglob("*") if each.is_file()]
+        contents = {str(each.relative_to(bench.folder)): each.read_bytes() for each in files}
+        return _Grown(contents, bench.clock, bench._traces)
+
+
 @cache
 def _begun_records() -> dict[str, bytes]:
     """A database as a station leaves it that has begun its chain and ended, and its key; made once,
@@ -128,6 +149,8 @@ class Bench:
     lock_timeout_s: float = 0.02
     heads: tuple[str | Path, ...] = ()
     """Other places than beside the key."""
+    grow: Callable[[Bench], object] | None = None
+    """What was done to the records before, the same for all tests."""
     _traces: int = 0
 
     def __post_init__(self) -> None:
@@ -135,8 +158,13 @@ class Bench:
         self.path = self.folder / "records.sqlite"
         self.trace = self.traced(SERIAL)
         self.keys.mkdir()
-        for name, data in _begun_records().items():
+        files = _begun_records()
+        if self.grow is not None:
+            grown = _grown(self.grow)
+            files, self.clock, self._traces = grown.files, replace(grown.clock), grown.traces
+        for name, data in files.items():
             file = self.folder / name
+            file.parent.mkdir(parents=True, exist_ok=True)
             file.touch(0o600)
             file.write_bytes(data)
         self.store = self.opened()

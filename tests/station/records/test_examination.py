@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +18,20 @@ from tests.station.records.test_places import forging, make_anew, told
 OTHER = "W2605003"
 
 
-@pytest.fixture
-def examined(bench: Bench) -> Bench:
-    """Records of two units that were examined, and found good."""
+def examine_two(bench: Bench) -> None:
     bench.make()
     bench.make(serial=OTHER)
     found = bench.store.examine()
     assert not found.problems
     assert found.since is None
-    return bench
+
+
+@pytest.fixture
+def examined(tmp_path: Path) -> Iterator[Bench]:
+    """Records of two units that were examined, and found good."""
+    made = Bench(tmp_path, grow=examine_two)
+    yield made
+    made.store.close()
 
 
 def go_on(bench: Bench) -> Examination:

@@ -305,11 +305,21 @@ def test_days_of_a_clock_in_another_zone_are_cut(
 # -- what is not in the sums, and sums of other records --------------------------------------------
 
 
-@pytest.fixture
-def made(bench: Bench) -> Lines:
-    """Four runs of a day."""
+def make_four(bench: Bench) -> None:
     for number in range(1, 5):
         bench.make(RunState.PASS, f"W260500{number}")
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    """Four runs of a day."""
+    made = Bench(tmp_path, grow=make_four)
+    yield made
+    made.store.close()
+
+
+@pytest.fixture
+def made(bench: Bench) -> Lines:
     return Lines(bench.store.database, random.Random(1), runs=4)
 
 
