@@ -32,6 +32,7 @@ from tests.cli.conftest import Flasher
 from tests.cli.station_threads import ThreadPort
 from tests.cli.test_main import broken_pipe, posix_pipes
 from tests.cli.test_schema import hold_output
+from tests.loops import each
 from tests.plant.conftest import plant, sender
 from tests.plant.factory import PASSWORD, Plant, Sender
 from tests.plant.old_databases import make_old
@@ -123,7 +124,7 @@ _READING: dict[str, tuple[str, ...]] = {
 }
 
 
-@pytest.mark.parametrize("action", _READING)
+@each("action", _READING)
 def test_tables_of_another_flasher_are_refused_with_the_next_step(
     flasher: Flasher, plant: Plant, action: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -671,9 +672,9 @@ def test_status_lists_units_that_passed_twice(
     flasher: Flasher, plant: Plant, sender: Sender
 ) -> None:
     other = plant.sender("line-3")
-    for each in (sender, other):
-        each.bench.make()
-        each.send()
+    for station in (sender, other):
+        station.bench.make()
+        station.send()
     other.close()
     run = flasher("plant", "status", "--database", plant.url(), "--json")
     hold_output(json.loads(SCHEMA.read_text("utf-8")), run.out, run.code)

@@ -50,15 +50,19 @@ def found(what: type, line: str) -> str:
 
 
 def test_a_right_bootloader_is_upgraded_and_a_line_replays_the_run() -> None:
-    verdict = played(RIGHT, f"{JOB} ; @packet2 drop count=3")
-    assert (verdict.ending, verdict.left, verdict.violations) == ("completed", "new", ())
-    assert verdict.is_good
-    assert played(RIGHT, verdict.plan) == verdict
+    with bench_of(RIGHT) as bench:
+        verdict = play(Plan.parse(f"{JOB} ; @packet2 drop count=3"), bench=bench)
+        assert (verdict.ending, verdict.left, verdict.violations) == ("completed", "new", ())
+        assert verdict.is_good
+        assert play(Plan.parse(verdict.plan), bench=bench) == verdict
 
 
-@each("device", ["application=none", "begins=boot", "drift=0.01", "version=V0r9r9_20200101"])
-def test_a_bootloader_begins_as_the_plan_says(device: str) -> None:
-    assert played(RIGHT, f"{JOB} {device}").is_good
+def test_a_bootloader_begins_as_the_plan_says() -> None:
+    with bench_of(RIGHT) as bench:
+        for device in (
+            "application=none", "begins=boot", "drift=0.01", "version=V0r9r9_20200101"
+        ):  # fmt: skip
+            assert play(Plan.parse(f"{JOB} {device}"), bench=bench).is_good, device
 
 
 @pytest.mark.slow
