@@ -12,6 +12,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 
 SAMPLES = Path(__file__).parents[2] / "firmware_samples"
@@ -62,12 +63,19 @@ def sparse(size: int, head: bytes = b"") -> Callable[[Path], object]:
     return make
 
 
+def deflated(piece: bytes, times: int) -> bytes:
+    """So many pieces without header and check sum, of which only the first one is compressed."""
+    packer = zlib.compressobj(1, wbits=-zlib.MAX_WBITS)
+    once = packer.compress(piece) + packer.flush(zlib.Z_FULL_FLUSH)
+    return once * times + packer.flush()
+
+
 def packed(piece: bytes, size: int) -> Callable[[Path], object]:
+    """More than is read of it, so that its check sum may be wrong."""
+
     def make(path: Path) -> None:
         block = piece * max(1, MEGA // len(piece))
-        with gzip.open(path, "wb", compresslevel=1) as file:
-            for _ in range(size // len(block)):
-                file.write(block)
+        path.write_bytes(gzip.compress(b"")[:10] + deflated(block, size // len(block)) + bytes(8))
 
     return make
 
@@ -386,10 +394,10 @@ REPORTS = tuple(
 
 def blf(inner: bytes, times: int = 1, packed_as: int = 2) -> bytes:
     """A .blf file with one container that holds `inner` so many times."""
-    packer = zlib.compressobj(1)
     held = inner
     if packed_as == 2:
-        held = b"".join(packer.compress(inner) for _ in range(times)) + packer.flush()
+        check_sum = reduce(lambda so_far, _: zlib.adler32(inner, so_far), range(times), 1)
+        held = zlib.compress(b"", 1)[:2] + deflated(inner, times) + struct.pack(">L", check_sum)
     container = struct.pack("<H6xL4x", packed_as, len(inner)) + held
     return (
         struct.pack("<4sL", b"LOGG", 144)
