@@ -34,7 +34,7 @@ from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import Message, encode, split
 from tests.end_to_end.stage import SMALL, Speaker, Stage, image_of
 from tests.host.bench import BOOT, Bench
-from tests.host.duplicates import Slow, play, world
+from tests.host.duplicates import Slow, World, play, world
 from tests.loops import each
 
 LATER_S = 0.006
@@ -431,19 +431,26 @@ def test_a_link_that_doubles_every_frame_is_no_second_device() -> None:
 SOME = range(1, 61)
 
 
+def any_world(seed: int, *, units: int) -> World:
+    """Where few frames are lost an image has 30 packets at most; campaigns have some of 120."""
+    made = world(seed, units=units)
+    most = made.packets if made.faults > 0.001 else 30
+    return dataclasses.replace(made, packets=min(made.packets, most))
+
+
 @pytest.mark.slow
 @pytest.mark.no_cover
 @each("seed", SOME)
 def test_two_units_that_both_show_themselves_are_never_a_success(seed: int) -> None:
     """What they may hide behind stands in docs/explanation/safety.md."""
-    judged = play(world(seed, units=2))
-    assert not judged.is_missed, world(seed, units=2)
+    given = any_world(seed, units=2)
+    assert not play(given).is_missed, given
 
 
 @pytest.mark.slow
 @pytest.mark.no_cover
 def test_nearly_all_worlds_with_two_units_end_as_two_devices() -> None:
-    ended = [play(world(seed, units=2)).is_two for seed in range(1001, 1041)]
+    ended = [play(any_world(seed, units=2)).is_two for seed in range(1001, 1041)]
     assert sum(ended) > 0.85 * len(ended)
 
 
@@ -452,6 +459,7 @@ def test_nearly_all_worlds_with_two_units_end_as_two_devices() -> None:
 @each("seed", SOME)
 def test_one_unit_is_never_two(seed: int) -> None:
     """Whatever a bad line, a virtual network and a pause of this computer make of it."""
-    judged = play(world(seed, units=1))
-    assert not judged.is_two, world(seed, units=1)
+    given = any_world(seed, units=1)
+    judged = play(given)
+    assert not judged.is_two, given
     assert not judged.is_false
