@@ -30,6 +30,7 @@ from tests.end_to_end.processes import (
     clean_environment,
     lines_until,
     run_flasher,
+    run_here,
 )
 from tests.end_to_end.test_processes import bus_words, free_port
 from tests.firmware import VECTORS
@@ -151,7 +152,7 @@ def trial(bike: Bike, seed: str, act: str, after_s: float) -> Trial:
         phase = last.reached and f"{last.reached.phase} {last.reached.packet}"
         at = f"{last.began.target}: {phase or (last.ended and last.ended.what) or 'identify'}"
     began_at = time.perf_counter()
-    again = run_flasher(*bike.words, folder=bike.folder)
+    again = run_here(*bike.words, folder=bike.folder)
     took_s = time.perf_counter() - began_at
     return Trial(act, at, again.returncode, tuple(bike.lacks()), took_s, again.stderr)
 

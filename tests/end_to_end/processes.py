@@ -5,9 +5,15 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Self
+
+import pytest
+
+from flasher.cli.main import main
 
 FLASHER = (sys.executable, "-m", "flasher")
 SERVING = "Ctrl-C ends it"
@@ -86,12 +92,29 @@ def run_flasher(*arguments: str, folder: Path) -> subprocess.CompletedProcess[st
     )
 
 
+def run_here(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Like `run_flasher`, in this process, which need not be started: the other one is the device.
+    Not for several threads.
+    """
+    out, err = StringIO(), StringIO()
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        redirect_stdout(out),
+        redirect_stderr(err),
+    ):
+        patch.chdir(folder)
+        for name in [name for name in os.environ if name.startswith("CAN_")]:
+            patch.delenv(name)
+        code = main(arguments)
+    return subprocess.CompletedProcess(arguments, code, out.getvalue(), err.getvalue())
+
+
 def transfer(
     mock: MockProcess, folder: Path, image: bytes, *bus: str, name: str = "image.bin"
 ) -> subprocess.CompletedProcess[str]:
     """Flash `image` to `mock` and see that it stored the same bytes, as `out.bin`."""
     (folder / name).write_bytes(image)
-    done = run_flasher("flash", "-t", "bms", *bus, name, folder=folder)
+    done = run_here("flash", "-t", "bms", *bus, name, folder=folder)
     assert done.returncode == 0, done.stderr
     mock.wait_for("image:")
     assert (folder / "out.bin").read_bytes() == image

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.end_to_end.processes import MockProcess, run_flasher
+from tests.end_to_end.processes import MockProcess, run_here
 from tests.end_to_end.test_processes import bus
 from tests.firmware import VECTORS
 
@@ -23,11 +23,11 @@ def test_a_mock_in_another_process_gets_the_verdicts_that_the_built_in_one_gets(
     (tmp_path / "good.bin").write_bytes(IMAGE)
     wanted = ("--case", "FR-08", "--case", "UP-08")
     with MockProcess("-t", "bms", *bus, folder=tmp_path):
-        done = run_flasher(
+        done = run_here(
             *("conformance", "-t", "bms", "--good-image", "good.bin", *wanted, "--json", *bus),
             folder=tmp_path,
         )
-    built_in = run_flasher("conformance", "-t", "bms", "--mock", *wanted, "--json", folder=tmp_path)
+    built_in = run_here("conformance", "-t", "bms", "--mock", *wanted, "--json", folder=tmp_path)
     found = [json.loads(run.stdout)["report"] for run in (done, built_in)]
     verdicts = [
         [(result["id"], result["status"]) for result in report["results"]] for report in found

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from flasher.history import FlashHistory
-from tests.end_to_end.processes import FLASHER, MockProcess, clean_environment, run_flasher
+from tests.end_to_end.processes import FLASHER, MockProcess, clean_environment, run_here
 from tests.end_to_end.test_processes import GROUP, bus, free_port
 from tests.firmware import VECTORS
 
@@ -68,7 +68,7 @@ def test_a_session_that_a_killed_host_left_open_is_finished_by_the_same_command(
         assert left.left_device_open
         assert left.reached is not None
         assert (left.reached.phase, left.reached.packet >= 7) == ("transfer", True)
-        done = run_flasher(*flash, folder=tmp_path)
+        done = run_here(*flash, folder=tmp_path)
         assert done.returncode == 0, done.stderr
         assert "power-cycle" not in done.stderr
         mock.wait_for("image:")
@@ -84,7 +84,7 @@ def kill_and_repair(bus: tuple[str, ...], tmp_path: Path, numbers: Iterable[int]
         for number in numbers:
             kill_at(number, (*flash, *SLOW), tmp_path)
             (tmp_path / "out.bin").unlink(missing_ok=True)
-            done = run_flasher(*flash, folder=tmp_path)
+            done = run_here(*flash, folder=tmp_path)
             assert done.returncode == 0, done.stderr
             assert "application reported no version" in done.stderr  # it has none
             mock.wait_for("image:")
