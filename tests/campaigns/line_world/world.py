@@ -88,7 +88,8 @@ OLD_VERSION: Final = DeviceProfile().factory_version
 _SLOW: Final = {"erase_time_s": 0.5, "program_time_s": 0.25}
 _AGAIN_S: Final = 1.0
 """After this time a station that could not start is started again."""
-_READY_S: Final = 4.0
+_READY_S: Final = 3.0
+"""On the way home; twice this time is more than `GREEN_S`."""
 _RUN_LIMIT_S: Final = 150.0
 _TRIES: Final = 4
 NOTICE_S: Final = 1.0
