@@ -28,7 +28,7 @@ from flasher.station.unit_run import UnitRun
 from flasher.station.unit_steps import UnitSteps
 from flasher.station.unit_target import StepFailedError
 from tests.campaigns import line_world
-from tests.campaigns.line_bugs import read_bugs
+from tests.campaigns.line_bugs import ACTS, read_bugs
 from tests.campaigns.line_world import undetectable
 from tests.campaigns.line_world.draw import setup_of
 from tests.campaigns.line_world.play import Played, draw, play, shrink
@@ -519,7 +519,7 @@ def test_lines_without_numbers_are_drawn_an_exchange_in_an_outage() -> None:
     bug = next(each for each in read_bugs() if each.name == "green-over-the-next")
     seeds = (seed for seed in count() if setup_of(Random(seed)).line.recipe == "plain")
     with swapped(bug.codes()):
-        assert any(draw(seed, SAMPLE_ACTS).kind == bug.kind for seed in islice(seeds, 10))
+        assert any(draw(seed, ACTS).kind == bug.kind for seed in islice(seeds, 10))
 
 
 _LOG_HASH: Final = re.compile(r"log_sha256='\w+'")

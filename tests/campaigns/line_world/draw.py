@@ -109,9 +109,11 @@ class Teller:
                 scenes += 3 * [self._scan_another_number]
             if recipe == "writes" and {"maker", "empty"} <= numbers:
                 scenes += 6 * [self._exchange_for_numberless]
+            if recipe == "plain":
+                scenes += 4 * [self._go_on_in_an_outage]
             chosen = self.chance.sample(scenes, 4)
-            if recipe == "plain":  # first: a unit that is left in its socket prevents it
-                chosen[0] = self._go_on_in_an_outage
+            if recipe == "plain":
+                chosen.append(self._go_on_with_one_alike)
             for scene in chosen:
                 yield from scene(self.chance.choice(people))
                 yield 3.0, None
@@ -398,10 +400,17 @@ class Teller:
             yield self.chance.uniform(0.2, 1.5), stories.KillStation(seconds=1.0)
             yield 5.0, None
 
-    def _go_on_in_an_outage(self, name: str) -> Iterator[Step]:
-        """A socket stops to work after a PASS, and somebody goes on with the next unit there."""
+    def _go_on_with_one_alike(self, name: str) -> Iterator[Step]:
+        yield from self._go_on_in_an_outage(name, is_untold=True)
+
+    def _go_on_in_an_outage(self, name: str, *, is_untold: bool = False) -> Iterator[Step]:
+        """A socket stops to work after a PASS, and somebody goes on with the next unit there.
+        `is_untold`: with two units that nobody can tell apart, if there are such.
+        """
         bays = yield from self._bring(2)
-        for bay in sorted(bays, key=lambda each: not self._is_untold(self._number(each))):
+        if is_untold:
+            bays.sort(key=lambda bay: not self._is_untold(self._number(bay)))
+        for bay in bays:
             unit = self._number(bay)
             yield self._pause(), stories.Card(by=name, unit=unit)
             yield self._pause(), stories.Label(by=name, unit=unit)
@@ -411,7 +420,7 @@ class Teller:
                 yield 0.5, None
             if label_of(unit) in self.world.passed:
                 yield self._pause(), None
-                yield from self._outage(bay.name)
+                yield from self._outage(bay.name, is_untold=is_untold)
                 yield 12.0, None  # nobody scans the next unit at once
                 return
 
@@ -548,7 +557,7 @@ class Teller:
             else:
                 yield wait, stories.KillStation(seconds=1.0 + seconds)
 
-    def _outage(self, socket: str) -> Iterator[Step]:
+    def _outage(self, socket: str, *, is_untold: bool = False) -> Iterator[Step]:
         """An adapter that is away, or a process that dies again and again, and a unit that is
         exchanged meanwhile.
         """
@@ -563,4 +572,4 @@ class Teller:
             yield 1.3, stories.KillWorker(socket=bay.name)
             yield 2.3, stories.KillWorker(socket=bay.name)
         if bay.unit is not None:
-            yield from self._put_another(bay, is_untold=self.chance.random() < 0.7)
+            yield from self._put_another(bay, is_untold=is_untold)
