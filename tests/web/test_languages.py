@@ -45,6 +45,7 @@ from tests.loops import each
 from tests.station.factory import SERIAL, USUAL, Bench
 from tests.station.line_bench import LineBench
 from tests.station.records.test_forgeries import Forger
+from tests.station.test_certificate_check import each_code_is_drawn_once
 from tests.station.test_exchanges import lose_power_once
 from tests.station.test_labels import template
 from tests.station.unit_bench import NEW_UNIT, UnitBench
@@ -52,6 +53,7 @@ from tests.web.answering import app_of, client_of
 from tests.web.bench_place import BenchPlace, order
 from tests.web.own_loop import in_own_loop
 
+__all__ = ["each_code_is_drawn_once"]
 FOREIGN = tuple(code for code in NAMES if code != "en")
 _ENGLISH = re.compile(r"(?:\b[A-Za-z]?[a-z]+[,;:]? ){2,}[a-z]{2,}\b")
 """Three words of English."""
