@@ -290,8 +290,8 @@ class Station:
         """One turn of the loop: wait up to `limit_s`, then do all due work."""
         if limit_s > 0:
             self.supervisor.wait([self._wake_receiver], limit_s)
-            while self._wake_receiver.poll():
-                self._wake_receiver.recv_bytes()
+        while self._wake_receiver.poll():
+            self._wake_receiver.recv_bytes()
         self.line.is_closing = self._is_stopping
         for socket, message in self.supervisor.poll():
             self._process_message(socket, message)
