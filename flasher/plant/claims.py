@@ -114,7 +114,7 @@ class PlantClaims:
         """Runs whose claim the plant has released, until they are taken."""
         self._is_swept = False
         self._own: _Own | None = None
-        """None before this station has stated it."""
+        """None before this station has stated it in a transaction that was committed."""
         self._fault: RecordError | None = None
         """Why the server did not answer last; None if it did."""
         self._clocks: tuple[float, float] | None = None
@@ -148,6 +148,7 @@ class PlantClaims:
                 own = self._enter(central)
                 values |= {"records": own.records, "takeover": own.takeover}
                 found = central.execute(_CLAIM, values).mappings().one()
+            self._own = own
         except RecordError as error:
             with self._mutex:
                 self._fault = error
@@ -212,6 +213,7 @@ class PlantClaims:
                 clocks = _compared(central, self._clock)
                 states = central.execute(_STATES_RELEASED).scalar_one()
                 released = central.execute(_RELEASED).all() if states else ()
+            self._own = own
             runs = {self._recorded(each.part, each.serial).get(each.token) for each in released}
         except RecordError as error:
             with self._mutex:
@@ -226,12 +228,14 @@ class PlantClaims:
             self._fault = None
 
     def _enter(self, central: Connection) -> _Own:
-        """State once from which records this station sends."""
-        if self._own is None:
+        """State from which records this station sends, unless a transaction that is over did: the
+        two threads are not to rely on what may still be rolled back.
+        """
+        own = self._own
+        if own is None:
             own = self._read()
             central.execute(ENTER, {"records": own.records, "station": self._station})
-            self._own = own
-        return self._own
+        return own
 
     def _read(self) -> _Own:
         with self._records.reading() as local:

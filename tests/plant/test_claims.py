@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
-from typing import Any
+from typing import Any, NoReturn
 
 import pytest
 
@@ -26,7 +26,7 @@ from flasher.plant.deliveries import document_of
 from flasher.plant.retire import Retirement
 from flasher.plant.setup import role_of, setup
 from flasher.station.gate import Gate
-from flasher.station.records.errors import ClaimRefusedError, Refusal
+from flasher.station.records.errors import ClaimRefusedError, RecordError, Refusal
 from flasher.station.records.model import (
     CHECKED,
     RELEASED_MARK,
@@ -292,6 +292,22 @@ def test_a_claim_is_renewed_while_the_run_lasts_and_not_after_it(
     expire(plant)
     here.claims.tend()
     assert there.asked().doubt
+
+
+def test_a_station_whose_first_contact_was_rolled_back_states_its_records_again(
+    lines: tuple[Line, Line], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else the plant refuses all its claims as those of a foreign station until it starts again."""
+
+    def lose(_connection: object, _clock: object) -> NoReturn:
+        raise RecordError("the server ended")
+
+    here, _ = lines
+    with monkeypatch.context() as patch:
+        patch.setattr("flasher.plant.claims._compared", lose)
+        here.claims.tend()
+    here.claims.tend()
+    assert duplicates(here, here.end(here.claim())) == "checked"
 
 
 def test_two_stations_without_the_server_both_pass_with_a_mark(
