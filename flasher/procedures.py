@@ -467,15 +467,16 @@ class Procedures:
             if isinstance(event, events.HostStalled):
                 stalls_s.append(event.stalled_s)
 
-        def watch_link(frame: Frame, *, sent: bool, now: float) -> None:
+        link = self.link
+
+        def watch_link(frame: Frame, *, sent: bool, now: float) -> None:  # noqa: ARG001  a tap
             nonlocal has_sent
             if sent:
                 has_sent = True
-            elif frame.is_error:
-                self._end_when_off(frame, sent=sent, now=now)
+            elif frame.is_error and link.is_off:  # messages are lost until it ends
+                raise bus_off_error(str(link))
 
         may_end = _may_end(session)
-        link = self.link
         before = link.health()
         self._check_bus("before anything was sent", session, before)
         received: int | None = None
@@ -510,11 +511,6 @@ class Procedures:
         if isinstance(silence, NoAnswerError):
             self._check_bus(silence.where, session, before)
         return result
-
-    def _end_when_off(self, frame: Frame, *, sent: bool, now: float) -> None:
-        """Tap that raises BusError at bus-off, because messages are lost until it ends."""
-        if frame[4] and self.link.is_off:
-            raise bus_off_error(str(self.link))
 
     def _check_bus(self, where: str, session: UpgradeSession, before: LinkHealth) -> None:
         """Raise BusError if the bus is silent, not only the device, or if the adapter was bus-off
