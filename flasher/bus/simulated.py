@@ -204,7 +204,7 @@ class SimulatedBus:
         while outbox and self._delivered_at is not None:
             queued_at, frame = outbox[0]
             taken_s = frame_bits(frame) / self._bitrate_bps
-            ends_at = max(self._sending_ends_at, queued_at) + taken_s
+            ends_at = self._begin_of(queued_at) + taken_s
             if ends_at > limit:
                 return
             for device in self._devices:
@@ -272,9 +272,6 @@ class SimulatedBus:
         if len(winners) > 1:
             queued_at = min(node.outbox[0][0] for node in winners)
             collides = any(node.outbox[0][1] != frame for node in winners)
-        # A paced clock wakes slightly late, the wire does not: a frame that waited for the previous
-        # one follows it without a gap.
-        begins_at = max(self._sending_ends_at, queued_at)
         if collides:
             self._sending, bits = (winners, None), self._collide(winners)
         else:
@@ -284,8 +281,14 @@ class SimulatedBus:
                 if node.tx_errors:
                     node.tx_errors -= 1
         taken_s = bits / self._bitrate_bps
-        self._sending_ends_at = begins_at + taken_s
+        self._sending_ends_at = self._begin_of(queued_at) + taken_s
         self.busy_s += taken_s
+
+    def _begin_of(self, queued_at: float) -> float:
+        """Return when a frame that was queued then begins. A paced clock wakes slightly late, the
+        wire does not: a frame that waited for the previous one follows it without a gap.
+        """
+        return max(self._sending_ends_at, queued_at)
 
     def _winners(self, waiting: Sequence[_Node]) -> Sequence[_Node]:
         """Select the senders of the frame that has priority, several if they send one id."""
