@@ -165,6 +165,16 @@ def share_percent(share: float) -> float:
     return math.floor(share * 1000 + _ROUNDING) / 10
 
 
+def share_text(share: float | None) -> str:
+    """Format a share as `share_percent`, without a decimal that is 0."""
+    return "-" if share is None else f"{share_percent(share):g} %"
+
+
+def figure_text(value: float) -> str:
+    """Format a mean or a deviation: five significant digits, more for a large whole number."""
+    return f"{value:,.0f}" if abs(value) >= 99_999.5 else f"{value:,.5g}"
+
+
 def duration_text(seconds: float | None) -> str:
     """Format a duration with three digits and a unit: 870 µs, 3.12 ms, 41.3 s, 2 min 05 s."""
     if seconds is None:

@@ -21,7 +21,7 @@ from starlette.routing import BaseRoute, Route
 from flasher.files import parse_json
 from flasher.i18n import text
 from flasher.protocol.text import printable
-from flasher.report.scale import share_percent
+from flasher.report.scale import share_text
 from flasher.station.board import Board, Replies, Row, shown
 from flasher.station.events import (
     LineStopped,
@@ -121,9 +121,7 @@ class ScreenHeader:
             },
             "hour": _counted(self.output.hour, translate),
             "shift": _counted(self.output.shift, translate),
-            "first": "-"
-            if self.output.first_pass_share is None
-            else translate.numbers(f"{share_percent(self.output.first_pass_share):g} %"),
+            "first": translate.numbers(share_text(self.output.first_pass_share)),
             "causes": [f"{code} {count}" for code, count in self.output.causes],
             "health": [
                 {

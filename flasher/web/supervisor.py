@@ -24,6 +24,7 @@ from flasher.i18n import text
 from flasher.report.base import Status
 from flasher.report.chart import WIDTHS, histogram
 from flasher.report.explain_page import status_of, story_context
+from flasher.report.scale import figure_text
 from flasher.station import codes
 from flasher.station.certificate import (
     RUN_WORDS,
@@ -37,7 +38,7 @@ from flasher.station.certificate import (
 )
 from flasher.station.certificate_check import check_certificate
 from flasher.station.records import chain
-from flasher.station.records.capability import VALUES_MIN, figure
+from flasher.station.records.capability import VALUES_MIN
 from flasher.station.records.errors import NotFoundError, RecordError, UnprovenError
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import (
@@ -433,7 +434,7 @@ class SupervisorPages:
             limits_of=lambda each: limits_of(
                 Measurement(each.name, each.mean, each.unit, each.low, each.high)
             ),
-            figure=lambda value: translate.numbers(figure(value)),
+            figure=lambda value: translate.numbers(figure_text(value)),
             values_min=VALUES_MIN,
             **self._choices(),
         )

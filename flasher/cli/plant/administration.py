@@ -34,7 +34,7 @@ from flasher.plant.schema import PLANT_SCHEMA
 from flasher.plant.setup import create_database, role_of, setup
 from flasher.plant.store import passed_twice
 from flasher.protocol.text import printable
-from flasher.report.scale import share_percent
+from flasher.report.scale import share_text
 from flasher.station.config import load_config
 from flasher.station.records.database import Location
 from flasher.station.records.model import RunState, Units
@@ -178,7 +178,7 @@ def _lines(of: StationOverview) -> Iterator[str]:
 
 
 def _yield_text(found: Units) -> str:
-    share = "" if found.yield_share is None else f" ({share_percent(found.yield_share):g} %)"
+    share = "" if found.yield_share is None else f" ({share_text(found.yield_share)})"
     return f"{found.passed:,} of {counted(found.units, 'unit')}{share}"
 
 

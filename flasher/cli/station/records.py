@@ -22,7 +22,8 @@ from flasher.cli.station.place import open_to_read
 from flasher.cli.station.views import figures_line
 from flasher.errors import ErrorCode, ExitCode, UsageError
 from flasher.protocol.text import printable
-from flasher.station.records.capability import VALUES_MIN, Basis, Capability, figure
+from flasher.report.scale import figure_text
+from flasher.station.records.capability import VALUES_MIN, Basis, Capability
 from flasher.station.records.errors import NotFoundError, UnprovenError
 from flasher.station.records.model import (
     TORN_TRACE,
@@ -250,8 +251,8 @@ def capability_lines(found: Sequence[Capability]) -> Iterator[str]:
 def _capability_text(each: Capability) -> str:
     unit = f" {each.unit}" if each.unit else ""
     values = counted(each.count, "value") + (f", {each.outside:,} outside" if each.outside else "")
-    deviation = "" if each.deviation is None else f", s {figure(each.deviation)}"
-    text = f"{values}; limits {each.limits}{unit}; mean {figure(each.mean)}{deviation}; "
+    deviation = "" if each.deviation is None else f", s {figure_text(each.deviation)}"
+    text = f"{values}; limits {each.limits}{unit}; mean {figure_text(each.mean)}{deviation}; "
     if each.basis is Basis.TOO_FEW:
         return f"{text}no Cpk: fewer than {VALUES_MIN} values"
     if each.basis is Basis.CONSTANT:

@@ -21,7 +21,7 @@ from rich.text import Text
 from flasher.cli.documents import to_json
 from flasher.cli.output import Output, counted, duration
 from flasher.protocol.text import printable
-from flasher.report.scale import share_percent
+from flasher.report.scale import share_text
 from flasher.station import events
 from flasher.station.board import NO_BADGES, Board, Row, device_event_text
 from flasher.station.events import LineStopped, SocketState, StationEvent
@@ -240,16 +240,12 @@ def _cut(line: str, style: str = "") -> Text:
     return Text(line, style=style, no_wrap=True, overflow="ellipsis")
 
 
-def percent(share: float | None) -> str:
-    return "-" if share is None else f"{share_percent(share):g} %"
-
-
 def figures_line(figures: Figures) -> str:
     failed = figures.units - figures.passed
-    first = percent(figures.first_pass_share)
+    first = share_text(figures.first_pass_share)
     line = (
         f"{counted(figures.units, 'unit')}: {figures.passed:,} passed, {failed:,} failed; "
-        f"yield {percent(figures.yield_share)}, first pass {first}"
+        f"yield {share_text(figures.yield_share)}, first pass {first}"
     )
     if figures.duration_median_s is not None:
         line += f"; median {duration(figures.duration_median_s)}"

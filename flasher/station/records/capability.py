@@ -66,11 +66,6 @@ class Capability:
         return f"at most {high}" if low is None else f"at least {low}"
 
 
-def figure(value: float) -> str:
-    """Format a mean or a deviation: five significant digits, more for a large whole number."""
-    return f"{value:,.0f}" if abs(value) >= 99_999.5 else f"{value:,.5g}"
-
-
 def capabilities(connection: Connection, chosen: RunFilter) -> list[Capability]:
     """The measurements with limits of the runs of a filter, without golden units."""
     found = [_capability(**row) for row in connection.execute(_query(chosen)).mappings()]

@@ -10,7 +10,8 @@ from collections.abc import Iterable
 
 import pytest
 
-from flasher.station.records.capability import VALUES_MIN, Basis, Capability, figure
+from flasher.report.scale import figure_text
+from flasher.station.records.capability import VALUES_MIN, Basis, Capability
 from flasher.station.records.model import Measurement, RunFilter, RunState, StepState
 from flasher.station.reports import Report
 from tests.station.factory import Bench
@@ -54,10 +55,10 @@ def only(bench: Bench, chosen: RunFilter = RunFilter()) -> Capability:  # noqa: 
 def test_no_figure_is_rounded_to_an_exponent(bench: Bench) -> None:
     measure(bench, (1_499_999.0, 1_500_001.0), low=1_234_567.0, high=99_999_999.5)
     found = only(bench)
-    assert (found.limits, figure(found.mean)) == ("1,234,567 to 99,999,999.5", "1,500,000")
+    assert (found.limits, figure_text(found.mean)) == ("1,234,567 to 99,999,999.5", "1,500,000")
     values = (99_999.7, -123_456.7, 40_153.4, 2.874168, 0.0001234567)
     shown = ["100,000", "-123,457", "40,153", "2.8742", "0.00012346"]
-    assert [figure(value) for value in values] == shown
+    assert [figure_text(value) for value in values] == shown
 
 
 def test_both_limits(bench: Bench) -> None:
