@@ -26,6 +26,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from datetime import date, time
@@ -111,6 +112,15 @@ class SerialNumberRule(TomlTable):
                 bound = "any" if most is None else most
                 raise ValueError(f"the number {text!a} is not from {self.number_min} to {bound}")
         return groups
+
+
+def groups_by(recipe: str, serial: str) -> dict[str, str]:
+    """Groups of a serial number by the text of a recorded recipe; {} if it cannot be read."""
+    try:
+        rule = SerialNumberRule.model_validate(tomllib.loads(recipe)["serial_number"])
+        return rule.read(serial)
+    except (KeyError, ValueError):  # of another flasher
+        return {}
 
 
 class Lot(TomlTable):

@@ -63,6 +63,7 @@ from flasher.station.messages import (
     WriteReply,
 )
 from flasher.station.operators import Crew
+from flasher.station.recipe import groups_by
 from flasher.station.recipe_changes import changes
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.recipe_offers import SCAN_DIGITS, Offer, Offers, used
@@ -822,7 +823,8 @@ class Station:
         if self._labels is None or not self._labels.prints_each:
             return
         if _not_labelled(run) is None and run.kind is not RunKind.VERIFY_ONLY:
-            self._labels.submit(self._label(run.socket, run))
+            groups = groups_by(self.recipes[run.socket].content, run.serial)
+            self._labels.submit(LabelJob(run.socket, run.serial, values_of(run, groups)))
 
     def _reprint(self, serial: str, data: Mapping[str, str]) -> Refused | None:
         """Print a label again; returns the refusal, or None."""
@@ -835,19 +837,12 @@ class Station:
             refused = _NOT_PASSED if last is None else _not_labelled(last.run)
             if refused is not None or last is None:
                 return refused
+            groups = groups_by(self.store.read.recipe(last.run.recipe_sha256), serial)
             self.store.note(AuditEvent.REPRINT, data)
         except RecordError as error:
             return Refused(codes.RECORD_NOT_SAVED.name, _error_line(error), error.remedy)
-        self._labels.submit(self._label("", last.run, is_reprint=True))
+        self._labels.submit(LabelJob("", serial, values_of(last.run, groups), is_reprint=True))
         return None
-
-    def _label(self, socket: str, run: RunRecord, *, is_reprint: bool = False) -> LabelJob:
-        try:
-            recipe = self.recipes.get(socket, self.recipe)
-            groups = recipe.recipe.serial_number.read(run.serial)
-        except ValueError:  # of a recipe with another pattern
-            groups = {}
-        return LabelJob(socket, run.serial, values_of(run, groups), is_reprint)
 
     def _publish_labels(self) -> None:
         for job, reason in () if self._labels is None else self._labels.take():

@@ -265,6 +265,16 @@ def test_a_label_is_printed_once_more_and_audited(bench: Bench) -> None:
     assert rows == ['{"by":"Jo","serial":"W2605002"}']
 
 
+def test_a_label_printed_once_more_is_that_of_the_recipe_of_its_run(bench: Bench) -> None:
+    bench.make()
+    bench.use(USUAL.replace("<week>", "<day>").replace("<year>", "<week>"))
+    printer = Printer(bench)
+    line = LineBench(bench, labels=printer.labels)
+    line.scan(f"REPRINT {SERIAL}")
+    assert printer.came.get(timeout=LIMIT_S) == b"^XA^FO40,40^FDW2605002  05^FS^XZ\n"
+    finished(line)
+
+
 def test_what_is_not_audited_is_not_printed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     def note(*_: object) -> None:
         raise DiskFullError("RECORD NOT SAVED: the disk is full.", remedy="Make room.")

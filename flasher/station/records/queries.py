@@ -130,6 +130,12 @@ class Records:
                 lives.append(UnitLife(serial, part, state, runs))
             return tuple(lives)
 
+    def recipe(self, sha256: str) -> str:
+        """The text of a recipe with which a run was made."""
+        query = select(schema.recipe.c.content).where(schema.recipe.c.sha256 == sha256)
+        with self._database.reading() as connection:
+            return str(connection.execute(query).scalar_one())
+
     def known(self, part: str, serials: Collection[str]) -> set[str]:
         """Those of `serials` that belong to recorded units of a part."""
         unit = schema.unit.c
