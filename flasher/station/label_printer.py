@@ -12,6 +12,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -56,6 +57,8 @@ class LabelPrinter:
         self._limit_s = limit_s
         self._wake: Callable[[], None] = lambda: None
         self._jobs: queue.Queue[LabelJob | None] = queue.Queue(BACKLOG_MAX)
+        self._unfinished: dict[int, LabelJob] = {}
+        """Queued labels by `id`. Who removes one reports it."""
         self._done: deque[tuple[LabelJob, str]] = deque()
         self._thread = threading.Thread(target=self._work, name="labels", daemon=True)
         self._sending: threading.Thread | None = None
@@ -67,27 +70,36 @@ class LabelPrinter:
 
     def submit(self, job: LabelJob) -> None:
         """Queue a label and return at once."""
+        self._unfinished[id(job)] = job
         try:
             self._jobs.put_nowait(job)
         except queue.Full:
-            self._done.append((job, text("Too many labels wait for the printer.")))
-            self._wake()
+            self._finished(job, text("Too many labels wait for the printer."))
 
     def take(self) -> list[tuple[LabelJob, str]]:
         """Labels finished since the last call, each with the reason of a failure, or ""."""
         return [self._done.popleft() for _ in range(len(self._done))]
 
     def close(self) -> None:
-        """Print the queued labels within one time limit, and end the thread."""
-        try:
+        """Print the queued labels within one time limit, and end the thread. `take` has the others
+        as failures.
+        """
+        with suppress(queue.Full):
             self._jobs.put_nowait(None)
-        except queue.Full:
-            return
         if self._thread.ident is not None:
             self._thread.join(self._limit_s)
+        for job in tuple(self._unfinished.values()):
+            self._finished(job, _too_slow(self._limit_s).args[0])
+
+    def _finished(self, job: LabelJob, reason: str) -> None:
+        if self._unfinished.pop(id(job), None) is not None:
+            self._done.append((job, reason))
+            self._wake()
 
     def _work(self) -> None:
         while (job := self._jobs.get()) is not None:
+            if id(job) not in self._unfinished:
+                continue
             reason = ""
             try:
                 self._send_in_time(self._template.fill(job.values))
@@ -95,8 +107,7 @@ class LabelPrinter:
                 reason = error.args[0]
             except Exception as error:  # noqa: BLE001  any error of the template is reported
                 reason = text("The label cannot be made: {why}.", why=printable(str(error))[:200])
-            self._done.append((job, reason))
-            self._wake()
+            self._finished(job, reason)
 
     def _send_in_time(self, data: bytes) -> None:
         """Send a label in another thread with a time limit, since Windows has none for devices or

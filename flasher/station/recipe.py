@@ -26,7 +26,6 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from datetime import date, time
@@ -35,7 +34,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from flasher.errors import printable
+from flasher.errors import FlasherError, printable
 from flasher.settings.bike_set import TargetImage, TargetTable, check_named_once
 from flasher.settings.toml_reader import Reader, TomlTable
 from flasher.station.pattern import CHECKS, TEXT_MAX, pattern_of
@@ -112,15 +111,6 @@ class SerialNumberRule(TomlTable):
                 bound = "any" if most is None else most
                 raise ValueError(f"the number {text!a} is not from {self.number_min} to {bound}")
         return groups
-
-
-def groups_by(recipe: str, serial: str) -> dict[str, str]:
-    """Groups of a serial number by the text of a recorded recipe; {} if it cannot be read."""
-    try:
-        rule = SerialNumberRule.model_validate(tomllib.loads(recipe)["serial_number"])
-        return rule.read(serial)
-    except (KeyError, ValueError):  # of another flasher
-        return {}
 
 
 class Lot(TomlTable):
@@ -339,6 +329,14 @@ class Recipe(TomlTable):
 
 _USUAL: Final = StepRule()
 RECIPE: Final = Reader(Recipe, "recipe")
+
+
+def groups_by(recipe: str, serial: str) -> dict[str, str]:
+    """Groups of a serial number by the text of a recorded recipe; {} if it cannot be read."""
+    try:
+        return RECIPE.parse(recipe.encode(), "").serial_number.read(serial)
+    except (FlasherError, ValueError):  # of another flasher
+        return {}
 
 
 # -- templates ------------------------------------------------------------------------------------

@@ -243,6 +243,27 @@ def test_a_backlog_has_an_end(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> 
     finished(line)
 
 
+def test_labels_that_wait_at_the_end_are_reported(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(label_printer, "BACKLOG_MAX", 1)
+    begun, goes_on = threading.Event(), threading.Event()
+
+    def hang(_data: bytes, _limit_s: float) -> None:
+        begun.set()
+        goes_on.wait(LIMIT_S)
+
+    labels = LabelPrinter(template(bench), hang, limit_s=0.05)
+    line = LineBench(bench, labels=labels)
+    line.make("A", SERIAL)
+    assert begun.wait(LIMIT_S)
+    line.make("B", OTHER)
+    finished(line)
+    assert sorted(event.serial for event in line.of(LabelFailed)) == [SERIAL, OTHER]
+    assert not line.of(LabelPrinted)
+    goes_on.set()
+
+
 # -- once more ------------------------------------------------------------------------------------
 
 
