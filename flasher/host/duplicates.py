@@ -13,8 +13,9 @@ sent, `received` and `frame_received` all that arrives. Evidence of a second dev
 
 Not evidence, because a single device or a bad line may cause it: a late answer to a repetition
 (R10), a refusal of the part of a packet that was sent before this computer paused (R12), general
-feedback besides the bootloader's own answers (R15), another request transfer before
-the first ACK (R16), an answer doubled by the link.
+feedback besides the bootloader's own answers (R15), another request transfer before the first ACK
+(R16), an ACK of end of transfer (figure 2 asks whether it came correctly; not for an image of one
+packet, where nothing else would show a second device), an answer doubled by the link.
 """
 
 from __future__ import annotations
@@ -236,6 +237,8 @@ class DuplicateDetector:
         elif command is Command.PACKET:
             self._packet = self._packet_of(packet)
             self._packet.unacknowledged += 1
+        elif command is Command.END_OF_TRANSFER and len(self._packets) > 1:
+            self._packet.unacknowledged += 1  # an ACK of it repeats the number of the last packet
         self._left_at = now
         self._has_ended = command is Command.END_OF_TRANSFER
         self._feedbacks.left()
@@ -493,6 +496,8 @@ class DuplicateDetector:
                 text("{what}, yet packet {number} was acknowledged", what=what, number=number)
             )
         packet = self._packets.get(number)
+        if packet is None and self._has_ended:
+            return
         if packet is None:  # never sent, or long ago
             self._packet.has_nak = True
             self._check_two_answers(self._packet)

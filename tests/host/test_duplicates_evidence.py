@@ -620,6 +620,29 @@ def test_a_refusal_of_the_image_is_no_answer_to_a_packet() -> None:
     assert watch.evidence == ""
 
 
+@each("number", [0, 2, 3])
+def test_end_of_transfer_may_be_acknowledged_as_often_as_it_was_sent(number: int) -> None:
+    watch = Watch().transfers(2)
+    for _ in range(2):
+        watch.sends(Command.END_OF_TRANSFER).wait(9).hears(Ack(number))
+    assert watch.evidence == ""
+
+
+def test_an_ack_of_end_of_transfer_is_no_second_answer_to_a_packet() -> None:
+    watch = odd(odd(Watch().transfers(1), 2), 2)
+    for _ in range(3):
+        watch.sends(Command.END_OF_TRANSFER).wait(9).hears(Ack(3))
+    assert watch.evidence == ""
+
+
+def test_a_second_ack_of_the_last_packet_beside_that_of_the_end_is_another_devices() -> None:
+    too_often = "packet {} was acknowledged more often than it was sent"
+    watch = Watch().transfers(2).sends(Command.END_OF_TRANSFER).wait(9).hears(Ack(2))
+    assert watch.wait(9).hears(Ack(2)).evidence == too_often.format(2)
+    watch = Watch().transfers(1).sends(Command.END_OF_TRANSFER).wait(9).hears(Ack(1))
+    assert watch.evidence == too_often.format(1)
+
+
 def test_a_packet_is_odd_once_and_only_when_each_copy_has_its_ack() -> None:
     watch = odd(Watch().transfers(0), 1).hears(*[Nak(1)] * 9)
     assert watch.evidence == ""
