@@ -33,9 +33,9 @@ from flasher.errors import (
 )
 from flasher.history import Flash, FlashHistory, left_open
 from flasher.host.identity import CheckResult, DeviceAnswers, judge_device, new_version
+from flasher.host.options import serial_number
 from flasher.procedures import check_no_other_tool, two_devices_error
 from flasher.protocol.contents import RunningInformation, VersionInformation
-from flasher.protocol.fields import Content
 from flasher.protocol.spec import BMS, OBC, WMC, Dialect, Target
 from flasher.protocol.text import printable
 from flasher.release.places import is_container
@@ -283,11 +283,6 @@ def check_same_battery(
                 "run it for the other one.",
                 code=ErrorCode.NOT_FOR_DEVICE,
             )
-
-
-def serial_number(answer: Content | None) -> str:
-    """Return the serial number in an answer to a version query, escaped; empty if it has none."""
-    return printable(str(getattr(answer, "serial_number", ""))).strip()
 
 
 def silence_text(target: Target) -> str:

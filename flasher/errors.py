@@ -140,6 +140,7 @@ class ErrorCode(StrEnum):
     TWO_DEVICES = "E605"
     LOW_CHARGE = "E606"
     NOT_TRUSTED = "E607"
+    OTHER_UNIT = "E608"
     TRANSFER = "E700"
     PACKET_FAILED = "E701"
     RESTARTED = "E702"

@@ -58,6 +58,7 @@ _TEXTS: Final[dict[str, dict[str, str]]] = {
         "no_answer": "the application does not answer",
         "in_bootloader": "a bootloader keeps announcing itself and no application answers",
         "memory_other": "the memory differs from the image",
+        "other_unit": "another unit answers",
         "two_devices": "two devices answer on the same id",
         "second_tool": "a second tool speaks on the bus",
         "interrupted": "interrupted by the user",

@@ -11,6 +11,7 @@ from flasher.image.plan import Plan
 from flasher.protocol.catalogue import BY_KEY
 from flasher.protocol.fields import Content
 from flasher.protocol.spec import Command, Target
+from flasher.protocol.text import printable
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 
 DEFAULT_ATTEMPTS: Final = 3
@@ -131,6 +132,11 @@ class UpgradeOptions:
 def firmware_version(answer: Content) -> str:
     """Firmware version in an answer to a version query, escaped."""
     return str(getattr(answer, "firmware_version", ""))
+
+
+def serial_number(answer: Content | None) -> str:
+    """Return the serial number in an answer to a version query, escaped; empty if it has none."""
+    return printable(str(getattr(answer, "serial_number", ""))).strip()
 
 
 def overall_timeout_s(plan: Plan, options: UpgradeOptions) -> float:

@@ -410,7 +410,10 @@ def _late(phase: Phase, left: DeviceLeft) -> _Explanation:
             cause = "no time was left to send end of transfer"
             return _Explanation(TransferError, cause, remedy)
         case Phase.TRANSFER:
-            cause = "the device answers late again and again, or the bus is congested"
+            cause = (
+                "the device lost power or contact, it answers late again and again, or the bus is "
+                "congested"
+            )
             return _Explanation(TransferError, cause, remedy)
         case Phase.END | Phase.CONFIRM:
             cause = "the final answer did not come in the time allowed"

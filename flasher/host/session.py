@@ -31,7 +31,7 @@ from flasher.host.identity import (
     judge_device,
     judge_image,
 )
-from flasher.host.options import UpgradeOptions, overall_timeout_s
+from flasher.host.options import UpgradeOptions, overall_timeout_s, serial_number
 from flasher.host.outcome import DeviceLeft, Outcome, ended_before_start
 from flasher.host.runner import Runner, Stage
 from flasher.host.table import Ending
@@ -136,6 +136,7 @@ class UpgradeSession(Runner[Result]):
         # device that may be in an open session is asked first: a running application would answer.
         waits = self._options.at_power_up and not self._options.in_session
         self._identify = None if waits else self._new_identify()
+        self._serial_before = ""
         receivers = (each for each in (*Node, None) if each not in (plan.target.node, Node.CDL))
         self._application_ids = frozenset(can_id(plan.target.node, each) for each in receivers)
         self._upgrade = UpgradeStage(self, plan, self._options)
@@ -212,6 +213,7 @@ class UpgradeSession(Runner[Result]):
             if refused is not None:
                 return refused
             previous = asked.answers.firmware_version
+            self._serial_before = serial_number(asked.answers.version)
             self._upgrade.announcement = asked.announcement
             self._identify = None
         self.limit_at = inf  # the upgrade observes its deadline itself
@@ -312,7 +314,9 @@ class UpgradeSession(Runner[Result]):
         self.emit(events.VerificationStarted(level.value))
         try:
             if level is Level.VERSION:
-                found = yield from check_version(self, self._plan, self._options)
+                found = yield from check_version(
+                    self, self._plan, self._options, self._serial_before
+                )
             else:
                 found = yield from check_memory(self, self._plan, running_version)
         except SecondToolSeen as tool:

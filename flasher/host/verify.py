@@ -22,7 +22,7 @@ from flasher.errors import (
     VerificationError,
     WrongDeviceError,
 )
-from flasher.host.options import UpgradeOptions, firmware_version
+from flasher.host.options import UpgradeOptions, firmware_version, serial_number
 from flasher.host.outcome import (
     TWO_DEVICES_CAUSE,
     TWO_DEVICES_REMEDY,
@@ -35,6 +35,7 @@ from flasher.i18n import text
 from flasher.image.image import AddressSpan
 from flasher.image.plan import Plan
 from flasher.protocol.contents import Memory, ReadMemory
+from flasher.protocol.fields import Content
 from flasher.protocol.messages import BootVersion, decode
 from flasher.protocol.spec import Target
 from flasher.protocol.timing import Announcing
@@ -61,6 +62,7 @@ class Verdict(Enum):
     NO_ANSWER = "no_answer"
     IN_BOOTLOADER = "in_bootloader"
     MEMORY_OTHER = "memory_other"
+    OTHER_UNIT = "other_unit"
     TWO_DEVICES = "two_devices"
     SECOND_TOOL = "second_tool"
     INTERRUPTED = "interrupted"
@@ -69,6 +71,7 @@ class Verdict(Enum):
 _LEFT: Final = {
     Verdict.NO_ANSWER: DeviceLeft.UNKNOWN,
     Verdict.IN_BOOTLOADER: DeviceLeft.NO_APPLICATION,
+    Verdict.OTHER_UNIT: DeviceLeft.UNKNOWN,
     Verdict.TWO_DEVICES: DeviceLeft.UNKNOWN,
     Verdict.SECOND_TOOL: DeviceLeft.UNKNOWN,
     Verdict.VERSION_OTHER: DeviceLeft.OTHER,
@@ -163,6 +166,15 @@ class Verification:
                 remedy=TWO_DEVICES_REMEDY,
                 code=ErrorCode.TWO_DEVICES,
             )
+        if self.verdict is Verdict.OTHER_UNIT:
+            return WrongDeviceError(
+                what,
+                cause="the unit was exchanged during the upgrade, or the new firmware reports "
+                "another serial number",
+                remedy="One unit has the new image, and the other one perhaps not: connect one "
+                "alone, look at it with flasher info, then at the other one.",
+                code=ErrorCode.OTHER_UNIT,
+            )
         if self.verdict is Verdict.SECOND_TOOL:
             return BusError(
                 what,
@@ -185,14 +197,24 @@ class Verification:
                 ),
                 code=ErrorCode.IN_BOOTLOADER,
             )
+        cause = "the device runs another image, or fell back to an older one"
         remedy = (
             "Power-cycle the device and look at it with flasher info; then flash the right image."
         )
+        if self.verdict is Verdict.NO_ANSWER:
+            cause = (
+                "the application starts slowly (application_start_timeout_s of a profile), does "
+                "not know the query, or does not start"
+            )
+            remedy = (
+                "Look at the device with flasher info; if it does not answer, power-cycle it and "
+                "look again, then flash it again."
+            )
         if self.device_left.needs_rescue:
             remedy = self._with_state(remedy)
         return VerificationError(
             what,
-            cause="the device runs another image, fell back to an older one, or does not start",
+            cause=cause,
             remedy=remedy,
             code=ErrorCode.OTHER_VERSION if self.verdict is Verdict.VERSION_OTHER else None,
         )
@@ -248,10 +270,12 @@ def check_level(plan: Plan, level: Level, options: UpgradeOptions | None = None)
         )
 
 
-def version_check(plan: Plan, options: UpgradeOptions) -> Runner[Verification]:
+def version_check(
+    plan: Plan, options: UpgradeOptions, serial_before: str = ""
+) -> Runner[Verification]:
     """Create an engine that waits for the new application and queries its version."""
     return Runner(
-        lambda run: check_version(run, plan, options),
+        lambda run: check_version(run, plan, options, serial_before),
         bitrate_bps=plan.bitrate_bps,
         timings=options.timings,
     )
@@ -270,8 +294,12 @@ def memory_check(
     )
 
 
-def check_version(run: Runner[Any], plan: Plan, options: UpgradeOptions) -> Stage[Verification]:
-    """Wait for the application and query its version. Raises ValueError without a version query."""
+def check_version(
+    run: Runner[Any], plan: Plan, options: UpgradeOptions, serial_before: str = ""
+) -> Stage[Verification]:
+    """Wait for the application and query its version; `serial_before` is its serial number before
+    the upgrade, "" if unknown. Raises ValueError without a version query.
+    """
     request = options.version_request_for(plan.target)
     if request is None:
         raise ValueError("this target has no version query")
@@ -298,13 +326,27 @@ def check_version(run: Runner[Any], plan: Plan, options: UpgradeOptions) -> Stag
         # One that starts it through its bootloader may need as long again.
         if run.now >= max(give_up_at, announcing.last_at + start_s):
             return Verification(Level.VERSION, Verdict.NO_ANSWER)
-    version = firmware_version(query.answer)
+    return _judge_version(run, plan, query.answer, serial_before)
+
+
+def _judge_version(
+    run: Runner[Any], plan: Plan, answer: Content, serial_before: str
+) -> Verification:
+    version = firmware_version(answer)
     if run.duplicates.evidence:
         return Verification(Level.VERSION, Verdict.TWO_DEVICES, version, run.duplicates.evidence)
+    serial_now = serial_number(answer)
+    if serial_before and serial_now and serial_now != serial_before:
+        detail = text(
+            "serial number {now}, it was {before} before the upgrade",
+            now=serial_now,
+            before=serial_before,
+        )
+        return Verification(Level.VERSION, Verdict.OTHER_UNIT, version, detail)
     expected = plan.image.version
     if expected is not None and version != expected:
-        detail = f"{version} instead of {expected}"
-        return Verification(Level.VERSION, Verdict.VERSION_OTHER, version, detail)
+        difference = f"{version} instead of {expected}"
+        return Verification(Level.VERSION, Verdict.VERSION_OTHER, version, difference)
     if run.is_cancelled:  # no second device could answer
         return Verification(Level.VERSION, Verdict.INTERRUPTED, version)
     verdict = Verdict.VERSION_UNJUDGED if expected is None else Verdict.VERSION_RIGHT

@@ -59,6 +59,7 @@ _OF_VERDICT: Final = {
     Verdict.NO_ANSWER: codes.NOT_RUNNING,
     Verdict.IN_BOOTLOADER: codes.IN_BOOTLOADER,
     Verdict.MEMORY_OTHER: codes.MEMORY_DIFFERS,
+    Verdict.OTHER_UNIT: codes.UNIT_CHANGED,
     Verdict.SECOND_TOOL: codes.SECOND_TOOL,
     Verdict.INTERRUPTED: codes.OPERATOR_ABORT,
 }

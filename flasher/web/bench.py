@@ -18,7 +18,7 @@ from typing import Final, TypeVar
 
 from flasher import events
 from flasher.api import Connection, DeviceInfo, Job, prepare, refusal
-from flasher.bike import SetImage, check_same_battery, open_bike_set, serial_number
+from flasher.bike import SetImage, check_same_battery, open_bike_set
 from flasher.errors import (
     ErrorCode,
     FlasherError,
@@ -36,6 +36,7 @@ from flasher.host.identity import (
     judge_device,
     new_version,
 )
+from flasher.host.options import serial_number
 from flasher.host.outcome import AGAIN
 from flasher.i18n import Text, text, with_value
 from flasher.image.image import Image

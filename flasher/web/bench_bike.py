@@ -10,9 +10,9 @@ from flasher.bike import (
     in_safe_order,
     judge_bike,
     look_at_bike,
-    serial_number,
 )
 from flasher.errors import InterruptedByUserError
+from flasher.host.options import serial_number
 from flasher.i18n import text
 from flasher.protocol.spec import BMS, Target
 from flasher.web.bench import RESCUE, BenchController, advise, changed_error

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from flasher import events
 from flasher.api import DeviceInfo, Result
-from flasher.bike import serial_number
 from flasher.errors import FlasherError
 from flasher.history import Flash
+from flasher.host.options import serial_number
 from flasher.host.verify import Verdict, Verification
 from flasher.protocol.spec import Target
 from flasher.report.base import visible

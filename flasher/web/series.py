@@ -13,7 +13,6 @@ from dataclasses import replace
 from math import ceil
 from typing import Final
 
-from flasher.bike import serial_number
 from flasher.driver import drive
 from flasher.errors import (
     BusError,
@@ -23,6 +22,7 @@ from flasher.errors import (
     InterruptedByUserError,
     UsageError,
 )
+from flasher.host.options import serial_number
 from flasher.i18n import text
 from flasher.procedures import two_devices_error
 from flasher.protocol.frame import Frame

@@ -57,7 +57,10 @@ def test_options_of_the_command_are_offered(complete: Complete) -> None:
     [
         ("flasher flash x.hex -t ", {"bms", "wmc", "mc", "obc", "pbu"}),
         ("flasher info --dialect ", {"welling", "motinova"}),
-        ("flasher help E60", {"E600", "E601", "E602", "E603", "E604", "E605", "E606", "E607"}),
+        (
+            "flasher help E60",
+            {"E600", "E601", "E602", "E603", "E604", "E605", "E606", "E607", "E608"},
+        ),
         ("flasher help mo", {"mock", "monitor"}),
         ("flasher scan -i socketc", {"socketcan", "socketcand"}),
         ("flasher monitor --node ", {"bms", "wmc", "mc", "obc", "pbu", "hmi", "cdl"}),

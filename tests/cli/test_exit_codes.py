@@ -279,7 +279,7 @@ CASES = [
     Case("no final answer", ExitCode.UNCONFIRMED, silent_since_the_end,
          "new application", "answer was lost", "Unconfirmed"),
     Case("does not run", ExitCode.VERIFICATION, application_is_silent,
-         "verification by version", "does not start", "Power-cycle"),
+         "verification by version", "starts slowly", "power-cycle"),
     Case("stays in its bootloader", ExitCode.VERIFICATION, stays_in_its_bootloader,
          "verification by version", "second device", "one BMS alone"),
     Case("up to date", ExitCode.NOTHING_TO_DO, up_to_date),

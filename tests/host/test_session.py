@@ -12,7 +12,8 @@ from flasher import events
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import Disturbance, SimulatedBus
 from flasher.driver import drive
-from flasher.errors import ExitCode, UsageError
+from flasher.errors import ErrorCode, ExitCode, UsageError, WrongDeviceError
+from flasher.host.identity import Identity, IdentityCheck
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft
 from flasher.host.runner import Runner
@@ -28,9 +29,10 @@ from flasher.host.verify import (
 )
 from flasher.image.image import Image
 from flasher.image.plan import Plan, plan
+from flasher.mock.bms import BmsApplication
 from flasher.mock.model import MockDevice
 from flasher.protocol import catalogue
-from flasher.protocol.contents import Memory, ReadMemory, VersionInformation
+from flasher.protocol.contents import Memory, ReadMemory, SerialNumber, VersionInformation
 from flasher.protocol.fields import Content, WireText
 from flasher.protocol.frame import Frame
 from flasher.protocol.messages import BootVersion
@@ -457,6 +459,51 @@ def test_a_bootloader_that_announces_itself_beside_the_new_application_is_a_seco
     while application.next_question() is not None:
         application.answer(VERSION, NEW_VERSION)
     assert check.result.verdict is Verdict.TWO_DEVICES
+
+
+@each(
+    "before, now, verdict",
+    [
+        ("W1", "W2", Verdict.OTHER_UNIT),
+        ("W1", "W1", Verdict.VERSION_RIGHT),
+        ("", "W2", Verdict.VERSION_RIGHT),
+        ("W1", "", Verdict.VERSION_RIGHT),
+    ],
+)
+def test_an_application_with_another_serial_number_than_before_is_another_unit(
+    before: str, now: str, verdict: Verdict
+) -> None:
+    check = version_check(planned(), UpgradeOptions(), before)
+    application = Application(check)
+    while application.next_question() is not None:
+        application.answer(VERSION, version(now))
+    assert check.result.verdict is verdict
+    assert check.result.running_version == NEW
+
+
+def test_a_unit_that_is_exchanged_during_the_upgrade_is_exit_code_6() -> None:
+    clock = VirtualClock()
+    bus = SimulatedBus(WELLING.bitrate_bps, clock)
+    device = MockDevice(BMS, bitrate_bps=WELLING.bitrate_bps)
+    application = device.application
+    assert isinstance(application, BmsApplication)
+    bus.attach(device)
+    session = UpgradeSession(
+        planned(), level=Level.VERSION, identity=Identity(waived=frozenset(IdentityCheck))
+    )
+
+    def exchange(event: object) -> None:
+        if isinstance(event, events.VerificationStarted):
+            other = SerialNumber(WireText(encode_text("W9", 16)))
+            application.kept["serial number"] = other
+
+    drive(session, bus.link(), clock, on_event=exchange)
+    error = session.result.error()
+    assert isinstance(error, WrongDeviceError)
+    assert error.code is ErrorCode.OTHER_UNIT
+    assert "serial number W9, it was W2605001 before the upgrade" in str(error)
+    assert session.result.outcome.is_completed
+    assert session.result.outcome.device_left is DeviceLeft.UNKNOWN
 
 
 @each("version, verdict", [(NEW, Verdict.INTERRUPTED), ("V1r0r0_20200101", Verdict.VERSION_OTHER)])

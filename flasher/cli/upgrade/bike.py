@@ -21,7 +21,6 @@ from flasher.bike import (
     judge_bike,
     look_at_bike,
     open_bike_set,
-    serial_number,
     silence_text,
 )
 from flasher.cli.adapters import check_heard, choose_adapter
@@ -48,6 +47,7 @@ from flasher.errors import (
 )
 from flasher.events import CheckMade
 from flasher.host.identity import CheckVerdict
+from flasher.host.options import serial_number
 from flasher.host.outcome import AGAIN
 from flasher.host.session import Result
 from flasher.host.verify import Level, possible_levels
