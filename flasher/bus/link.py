@@ -101,6 +101,27 @@ class StampingLink(Link, Protocol):
         ...
 
 
+def _clocks() -> tuple[int, int] | None:
+    for names in (("CLOCK_BOOTTIME", "CLOCK_MONOTONIC"), ("CLOCK_MONOTONIC", "CLOCK_UPTIME_RAW")):
+        if all(hasattr(time, name) for name in names):
+            return getattr(time, names[0]), getattr(time, names[1])
+    return None
+
+
+_CLOCKS: Final = _clocks()
+"""A clock that counts the time in which this computer is suspended, and one that does not; None on
+Windows, where `time.perf_counter` counts it."""
+
+
+def suspended_s() -> float:
+    """Total time for which this computer was suspended and `time.perf_counter` stood still."""
+    if _CLOCKS is None:
+        return 0.0
+    with_it, without_it = _CLOCKS
+    # A pause of this process between two readings makes their difference smaller.
+    return max(time.clock_gettime(with_it) - time.clock_gettime(without_it) for _ in range(2))
+
+
 class MonotonicClock:
     """Real time: `time.perf_counter`, unaffected by changes of the wall clock."""
 

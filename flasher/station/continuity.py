@@ -59,6 +59,10 @@ _UNOBSERVED: Final = (
     " announce itself in the same way."
 )
 
+_SUSPENDED: Final = (
+    "This computer was suspended for {}: another unit could have been connected meanwhile."
+)
+
 
 class Continuity:
     """Watches the traffic of one target for evidence of an exchange since it was identified.
@@ -201,6 +205,10 @@ class Continuity:
         elif passed_s < inf:
             self._miss(passed_s)
         self._now = now
+
+    def was_suspended(self, missed_s: float) -> None:
+        """Note that this computer was suspended: a restart of the unit was not received."""
+        self.unobserved = self.unobserved or _SUSPENDED.format(f"{missed_s:.0f} s")
 
     def was_away(self, away_s: float) -> None:
         """Note that the adapter was away for `away_s` up to now."""

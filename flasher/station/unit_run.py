@@ -12,6 +12,7 @@ from contextlib import suppress
 from typing import Final
 
 from flasher.api import Connection
+from flasher.bus.link import suspended_s
 from flasher.errors import (
     BusError,
     FlasherError,
@@ -26,7 +27,7 @@ from flasher.station.continuity import Continuity
 from flasher.station.events import OperatorPrompted, Progressed, StepEnded, StepStarted
 from flasher.station.messages import Journal, JournalError, RunEvent
 from flasher.station.power import PowerControl
-from flasher.station.presence import BLIND_S, TargetWatcher
+from flasher.station.presence import BLIND_S, PAUSE_S, TargetWatcher
 from flasher.station.recipe import AfterRestart, StepRule
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.model import (
@@ -119,6 +120,7 @@ class UnitRun:
         }
         for each in self._continuity.values():
             each.listened(self._clock.now())
+        self._suspended_s = suspended_s()
         self._may_restart = may_restart
         self._power = None if power is None else _NotedPower(power, self._continuity.values())
         self._step: tuple[StepName, str] = (StepName.CONNECT, "")
@@ -254,6 +256,7 @@ class UnitRun:
 
     def _changed(self, steps: UnitSteps) -> StepFailedError | None:
         """The error for a unit that may have been exchanged; it precedes all others."""
+        self._note_suspension()
         lost = next((each.lost for each in self._continuity.values() if each.lost), "")
         unobserved = next((e.unobserved for e in self._continuity.values() if e.unobserved), "")
         if not (lost or unobserved):
@@ -301,11 +304,18 @@ class UnitRun:
     def _is_lost(self) -> bool:
         """True if the unit may have been exchanged; called between frames."""
         now = self._clock.now()
+        self._note_suspension()
         for each in self._continuity.values():
             each.listened(now)
             if each.lost or each.unobserved:
                 return True
         return False
+
+    def _note_suspension(self) -> None:
+        missed_s = suspended_s() - self._suspended_s
+        if missed_s > PAUSE_S and not self._may_restart:
+            for each in self._continuity.values():
+                each.was_suspended(missed_s)
 
     def _progress(self, share: float) -> None:
         now = self._clock.now()

@@ -25,8 +25,10 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from flasher.api import Connection, connect
+from flasher.bus.link import suspended_s
 from flasher.errors import BusError, FlasherError, TransmitBlockedError, UsageError
 from flasher.files import make_private
+from flasher.i18n import text
 from flasher.log import log_event
 from flasher.protocol.text import printable
 from flasher.station import codes
@@ -48,7 +50,7 @@ from flasher.station.messages import (
     packed,
 )
 from flasher.station.power import PowerCommand, PowerControl
-from flasher.station.presence import BLIND_S, Presence
+from flasher.station.presence import BLIND_S, PAUSE_S, Presence
 from flasher.station.recipe_file import DAMAGED_COPY, LoadedRecipe, load_recipe
 from flasher.station.records.model import Claim, Measurement, RunResult, RunState
 from flasher.station.unit_run import UnitRun
@@ -213,6 +215,7 @@ class Worker:
         self._power: PowerControl | None = PowerCommand(setup.power) if setup.power else virtual
         self._presence = Presence([each.profile for each in recipe.targets])
         self._listened_at = connection.clock.now()
+        self._suspended_s = suspended_s()
         self._is_down = False
         """True while the adapter has failed."""
         self._is_blocked = False
@@ -260,6 +263,11 @@ class Worker:
             self._pipe.send(AdapterDown(error.what))
         self._listened()
         virtual = self._virtual
+        if virtual is None and not self._is_down and self._was_suspended():
+            # No frame was received meanwhile: the unit may be another one.
+            self._is_down = True
+            self._pipe.send(AdapterDown(text("This computer was suspended.")))
+            return
         change = self._presence.change(clock.now()) if virtual is None else virtual.step()
         if change is not None:
             self._pipe.send(change)
@@ -274,6 +282,11 @@ class Worker:
         if now - self._listened_at > blind_s:
             self._presence.miss(now - self._listened_at, now)
         self._listened_at = now
+
+    def _was_suspended(self) -> bool:
+        """True if this computer was suspended since the last call."""
+        before, self._suspended_s = self._suspended_s, suspended_s()
+        return self._suspended_s - before > PAUSE_S
 
     def _reopen(self) -> None:
         clock = self._connection.clock
@@ -306,7 +319,7 @@ class Worker:
                         self._pipe.send(change)
                     watchers = presence.watchers
                     was_exchanged = presence.exchanged_number > claim.presence
-                    was_missed = presence.missed_number > claim.presence
+                    was_missed = presence.missed_number > claim.presence or self._was_suspended()
                     was_silent = presence.is_there is False
                 run = UnitRun(
                     claim,
@@ -360,8 +373,8 @@ def pack(path: Path) -> str:
     return hashlib.sha256(made.read_bytes()).hexdigest()
 
 
-def _error_result(code: codes.Code, text: str) -> RunResult:
-    return RunResult(code.outcome, code.name, printable(text), 0.0)
+def _error_result(code: codes.Code, what: str) -> RunResult:
+    return RunResult(code.outcome, code.name, printable(what), 0.0)
 
 
 Opened = AbstractContextManager[tuple[Connection, VirtualSocket | None]]

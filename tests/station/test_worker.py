@@ -487,6 +487,56 @@ def test_an_order_from_before_a_pause_of_this_computer_is_not_carried_out(tmp_pa
     assert "did not listen before the run began" in ended.text
 
 
+class Suspends(RealSocket):
+    """This computer is suspended for a minute, which its clock does not count; a unit that is alike
+    is put in meanwhile, and its announcement is not received.
+    """
+
+    def __init__(self, folder: Path, when: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        super().__init__(folder)
+        self.when, self.boot_s = when, 60.0
+        time_of = {time.CLOCK_BOOTTIME: lambda: self.boot_s, time.CLOCK_MONOTONIC: lambda: 0.0}
+        monkeypatch.setattr(time, "clock_gettime", lambda clock: time_of[clock]())
+
+    def answer(self, channel: FakeChannel, message: FromWorker) -> None:
+        if isinstance(message, AdapterDown):
+            channel.waiting.append(Stop(ends_process=True))
+            return
+        if self.when == "write" and isinstance(message, StepStarted) and message.step == "write":
+            self.boot_s += 60.0
+        super().answer(channel, message)
+
+    def begin(self) -> None:
+        if self.when != "write":
+            self.boot_s += 60.0
+        if self.when != "idle":
+            super().begin()
+
+
+@pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="a clock of Linux")
+@pytest.mark.parametrize("when", ["order", "write"])
+def test_a_run_in_which_this_computer_is_suspended_is_not_observed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, when: str
+) -> None:
+    socket = Suspends(tmp_path, when, monkeypatch)
+    ended = socket.work()
+    assert ended is not None
+    assert ended.code == "NOT_OBSERVED", ended.text
+    assert not [each for each in socket.channel.of(Ask) if isinstance(each.what, JournalWrite)][2:]
+
+
+@pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="a clock of Linux")
+def test_a_socket_is_out_of_service_after_this_computer_was_suspended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    socket = Suspends(tmp_path, "idle", monkeypatch)
+    connection = Connection(socket.bus.link(), socket.clock, "a bus")
+    Worker(socket.setup, socket.recipe, socket.line, connection).work()
+    assert [each.reason for each in socket.channel.of(AdapterDown)] == [
+        "This computer was suspended."
+    ]
+
+
 class SlowRecords(InBootloader):
     """The station takes 2 s to save something."""
 
