@@ -40,7 +40,7 @@ _WINDOW: Final = 3
 """Batches in the cluster for each worker."""
 _CONNECT_S: Final = 10.0
 _WORKER_S: Final = 60.0
-"""Time in which the first worker has to be there."""
+"""Time in which the first worker, and each result or a worker after it, has to be there."""
 _GATHER_S: Final = 10.0
 _POLL_S: Final = 0.05
 _SCHEDULER_ENDED: Final = "its scheduler ended or was restarted"
@@ -111,16 +111,22 @@ def run_on_cluster(
     plugin = CampaignPlugin(run_one)
     with _connected(address, plugin) as client:
         todo = _Todo(client, batches, plugin.name)
+        has_worker_until = time.perf_counter() + _WORKER_S
         try:
             while not is_stopped():
                 try:
                     are_left, ended = todo.submit(), todo.ended()
+                    now = time.perf_counter()
+                    if ended or (now >= has_worker_until and todo.has_workers()):
+                        has_worker_until = now + _WORKER_S
                 except OSError as error:
                     raise _lost(_SCHEDULER_ENDED) from error
                 for batch, result in ended:
                     on_result(batch, result)
                 if not are_left:
                     return
+                if now >= has_worker_until:
+                    raise _lost(f"it had no worker and gave no result for {_WORKER_S:g} s")
                 if not ended:
                     time.sleep(_POLL_S)
         finally:
@@ -239,6 +245,9 @@ class _Todo:
             self._running[future.key] = future, batch
             self._completed.add(future)
         return bool(self._running)
+
+    def has_workers(self) -> bool:
+        return bool(self._client.nthreads())
 
     def ended(self) -> list[tuple[Batch, Result]]:
         """Return the results that have come since."""

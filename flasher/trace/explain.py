@@ -37,7 +37,7 @@ from flasher.trace.story import (
     TraceVerdict,
     UpgradeStory,
 )
-from flasher.trace.verdict import judge, remarks
+from flasher.trace.verdict import judge, remarks, times
 from flasher.wording import explanation
 
 MAX_TALKERS: Final = 100
@@ -321,8 +321,8 @@ class _StoryBuilder:
         if self._announcements:
             cause = Cause.QUERIES_ONLY
             text = (
-                f"A bootloader announced itself {self._announcements} time(s), and no tool began "
-                "an upgrade."
+                f"A bootloader announced itself {times(self._announcements)}, and no tool began an "
+                "upgrade."
             )
         elif self._has_nodes:
             cause = Cause.QUERIES_ONLY

@@ -116,10 +116,11 @@ def _bus_cause(upgrade: ObservedUpgrade, *, is_alone: bool) -> _Found | None:
     is_cut_in = upgrade.interleaving.found and upgrade.damage_from_tool
     if is_cut_in and not upgrade.is_one_tool:
         begun = "began inside another one"
-        text = f"On the tool's own CAN id a message {begun}, {upgrade.interleaving.found} time(s)."
+        found = times(upgrade.interleaving.found)
+        text = f"On the tool's own CAN id a message {begun} {found}."
         return _Found(Cause.SECOND_TOOL, text)
     if is_alone and upgrade.errors:
-        text = f"Only the tool's frames and {upgrade.errors:,} error frame(s) are on this bus."
+        text = f"Only the tool's frames and error frames ({upgrade.errors:,}) are on this bus."
         return _Found(Cause.NOBODY_ACKNOWLEDGES, text)
     if upgrade.boot_changes or upgrade.extra_acks >= _EXTRA_ACKS:
         text = f"{upgrade.extra_acks} packets that were sent once had two ACKs."
@@ -161,7 +162,7 @@ def _before_update(upgrade: ObservedUpgrade, until_s: float) -> _Found:
     if upgrade.feedbacks:
         text = f"The application of the {node} confirmed the reset, and no boot version followed."
         return _Found(Cause.NO_BOOT_VERSION, text + _short(until_s - upgrade.last_at_s))
-    text = f"The reset was sent {_times(upgrade.resets)}, and the {node} did not answer."
+    text = f"The reset was sent {times(upgrade.resets)}, and the {node} did not answer."
     if upgrade.resets >= _RESETS or until_s - upgrade.begin_s >= _SILENT_S:
         return _Found(Cause.NO_BOOT_VERSION, text)
     return _Found(Cause.RECORDING_ENDS, text)
@@ -169,7 +170,7 @@ def _before_update(upgrade: ObservedUpgrade, until_s: float) -> _Found:
 
 def _in_update(upgrade: ObservedUpgrade) -> _Found:
     node = upgrade.target.node.name
-    sent = f"The update command was sent {_times(upgrade.updates)}"
+    sent = f"The update command was sent {times(upgrade.updates)}"
     if upgrade.feedbacks_after_update:
         text = f"{sent}; the application of the {node} answers it, not the bootloader."
         return _Found(Cause.UPDATE_NOT_TAKEN, text)
@@ -183,7 +184,7 @@ def _in_transfer(upgrade: ObservedUpgrade, silent_s: float) -> _Found:
     node, packet = upgrade.target.node.name, upgrade.current
     if upgrade.is_restarted:
         at = "" if packet is None else f" at packet {packet.number} of {upgrade.total}"
-        text = f"The {node} restarted{at}, {_times(upgrade.restarts)} in all."
+        text = f"The {node} restarted{at}, {times(upgrade.restarts)} in all."
         return _Found(Cause.DEVICE_RESTARTED, text)
     if upgrade.is_cut_short:
         after = "" if packet is None else f" after packet {packet.number} of {upgrade.total}"
@@ -193,12 +194,12 @@ def _in_transfer(upgrade: ObservedUpgrade, silent_s: float) -> _Found:
     which = f"Packet {packet.number} of {upgrade.total}"
     if packet.answered_at_s is not None:
         return _stopped(f"{which} was acknowledged, and nothing followed.", silent_s)
-    sent = f"{which} was sent {_times(packet.tries)}"
+    sent = f"{which} was sent {times(packet.tries)}"
     if upgrade.damage_now * 2 >= packet.tries:
         pieces = f"{_pieces(upgrade.damage_now)} among tool and device"
         return _Found(Cause.PACKET_DAMAGED, f"{sent} whole and never acknowledged; {pieces}.")
     if packet.naks * 2 >= packet.tries and packet.naks > 1:
-        return _Found(Cause.PACKET_REFUSED, f"{sent} and refused {_times(packet.naks)} (NAK).")
+        return _Found(Cause.PACKET_REFUSED, f"{sent} and refused {times(packet.naks)} (NAK).")
     if packet.naks and packet.tries == 1:
         return _stopped(f"{which} was refused once, and was not sent again.", silent_s)
     if packet.tries > 1 or silent_s >= _ACK_WAIT_S:
@@ -221,15 +222,15 @@ def _at_end(upgrade: ObservedUpgrade) -> _Found:
     if upgrade.end_naks:
         text = (
             f"The {node} has every packet and answered the end of the transfer with NAK, "
-            f"{_times(upgrade.end_naks)}."
+            f"{times(upgrade.end_naks)}."
         )
         return _Found(Cause.REFUSED, text)
     text = (
-        f"Every packet is acknowledged, the end was sent {_times(upgrade.ends)}, and neither "
+        f"Every packet is acknowledged, the end was sent {times(upgrade.ends)}, and neither "
         "complete nor NAK came."
     )
     if upgrade.boots_after_end:
-        text += f" The bootloader announced itself {_times(upgrade.boots_after_end)} after it."
+        text += f" The bootloader announced itself {times(upgrade.boots_after_end)} after it."
     if upgrade.running_version is not None:
         text += (
             f" An application answers, version {upgrade.running_version}; the packets hold no "
@@ -256,7 +257,7 @@ def _short(silent_s: float) -> str:
     return " The trace ends here: either the tool gave up, or the recording was stopped."
 
 
-def _times(count: int) -> str:
+def times(count: int) -> str:
     return {1: "once", 2: "twice"}.get(count, f"{count} times")
 
 
@@ -268,7 +269,7 @@ def remarks(upgrade: ObservedUpgrade, cause: Cause) -> tuple[str, ...]:
     found = []
     names = upgrade.boot_names
     if upgrade.restarts and cause is not Cause.DEVICE_RESTARTED:
-        found.append(f"the device restarted in the transfer {_times(upgrade.restarts)}")
+        found.append(f"the device restarted in the transfer {times(upgrade.restarts)}")
     if upgrade.early_complete and cause is not Cause.COMPLETE_TOO_EARLY:
         found.append("the device reported complete before the end of the transfer was sent")
     if upgrade.boot_changes and cause is not Cause.TWO_DEVICES:
@@ -282,11 +283,11 @@ def remarks(upgrade: ObservedUpgrade, cause: Cause) -> tuple[str, ...]:
     if upgrade.intrusions and cause is not Cause.SECOND_TOOL:
         found.append(f"not explained by this upgrade: {'; '.join(upgrade.intrusions)}")
     if upgrade.errors and cause not in {Cause.BUS_TROUBLE, Cause.NOBODY_ACKNOWLEDGES}:
-        found.append(f"{upgrade.errors:,} error frame(s) in the meantime")
+        found.append(f"error frames in the meantime: {upgrade.errors:,}")
     if upgrade.damage_from_tool:
         found.append(f"{_pieces(upgrade.damage_from_tool)} on the tool's id")
     if upgrade.damage_from_device:
         found.append(f"{_pieces(upgrade.damage_from_device)} on the device's id")
     if upgrade.end_naks and cause is not Cause.REFUSED:
-        found.append(f"the end of the transfer was refused {_times(upgrade.end_naks)}")
+        found.append(f"the end of the transfer was refused {times(upgrade.end_naks)}")
     return tuple(found)

@@ -220,6 +220,30 @@ def test_a_cluster_that_ends_is_reported() -> None:
     assert "--ledger" in lost.value.remedy
 
 
+def test_a_cluster_whose_workers_are_all_gone_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clusters, "_WORKER_S", 2.0)
+    with LocalCluster(
+        n_workers=1,
+        threads_per_worker=1,
+        processes=False,
+        dashboard_address=":0",
+        silence_logs=100,
+    ) as made:
+
+        def end(_batch: Batch, _result: Result) -> None:
+            made.scale(0)
+
+        with pytest.raises(UsageError, match="lost a batch") as lost:
+            run_on_cluster(
+                made.scheduler_address,
+                without_canaries(1000, 1000),
+                on_result=end,
+                is_stopped=never,
+                run_one=run_slowly,
+            )
+    assert "had no worker" in lost.value.cause
+
+
 def test_an_address_without_a_scheduler_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clusters, "_CONNECT_S", 0.5)
     for address in ("127.0.0.1:1", "no address:x"):

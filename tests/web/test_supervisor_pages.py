@@ -21,7 +21,7 @@ from tests.web.conftest import Tab
 
 LONG = "W" * 90
 PAGES = (
-    "/runs", "/runs?from=yesterday", "/units", "/units?serial=W2605001", "/runs/2/trace",
+    "/runs", "/runs?from=yesterday", "/units", "/units?serial=W2605009", "/runs/2/trace",
     "/units/certificate?serial=W2605001", "/yield?by=lot", "/times", "/images", "/audit",
     "/certificate",
 )  # fmt: skip
@@ -47,6 +47,7 @@ def plant() -> Iterator[Bench]:
             bench.make(RunState.PASS, serial, lot=f"L{number}")
         run_id = bench.claim("W2605009", lot=LONG, reason=LONG).run_id
         bench.work(run_id)
+        bench.store.intent(run_id, "bms", LONG, LONG)
         found = [Measurement("voltage", 29.0, "V", 30.0, 42.0)]
         found += (Measurement("bms model", text="W" * size) for size in range(1, 41, 3))
         bench.store.step(

@@ -291,10 +291,14 @@ class Store:
         ended_s = self._clock.monotonic_s()
         table = schema.step.c
         counted = select(
-            func.coalesce(func.max(table.position), 0), func.count().filter(table.name == name)
+            func.coalesce(func.max(table.position), 0),
+            func.count().filter(table.name == name),
+            func.max(table.begun_monotonic_s),
         ).where(table.run_id == run_id)
         with self.database.writing() as connection:
-            position, tries = connection.execute(counted).one()
+            position, tries, before_s = connection.execute(counted).one()
+            # Virtual units measure a duration in their own time.
+            begun_s = max(ended_s - duration_s, -math.inf if before_s is None else before_s)
             step_id = insert(
                 connection,
                 schema.step,
@@ -305,8 +309,8 @@ class Store:
                 state=state.value,
                 code=code,
                 text=text,
-                begun_at=utc_text(self._clock.utc() - timedelta(seconds=duration_s)),
-                begun_monotonic_s=ended_s - duration_s,
+                begun_at=utc_text(self._clock.utc() - timedelta(seconds=ended_s - begun_s)),
+                begun_monotonic_s=begun_s,
                 duration_s=duration_s,
             )
             for each in measurements:

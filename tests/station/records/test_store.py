@@ -70,6 +70,19 @@ def test_a_finished_run_says_what_was_done(bench: Bench) -> None:
     assert not bench.store.examine().problems
 
 
+def test_no_step_begins_before_the_one_before_it(bench: Bench) -> None:
+    """A virtual unit measures durations in its own time, which passes faster."""
+    run_id = bench.claim().run_id
+    for name, duration_s in (("flash", 8.0), ("verify", 20.0)):
+        bench.clock.go_on(9.0)
+        bench.store.step(run_id, name, StepState.PASS, duration_s=duration_s)
+    with bench.outsider() as other:
+        query = "SELECT begun_at, begun_monotonic_s FROM step ORDER BY position"
+        begun = other.execute(query).fetchall()
+    assert begun == sorted(begun)
+    assert begun[0] == begun[1]
+
+
 def test_tries_of_a_step_are_counted(bench: Bench) -> None:
     run_id = bench.claim().run_id
     for name in ("flash", "flash", "write", "flash"):
