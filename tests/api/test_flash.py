@@ -353,6 +353,7 @@ class Babbling(FakeLink):
         return Frame(0x001, b"babble")
 
 
+@pytest.mark.slow
 def test_a_babbling_bus_keeps_an_upgrade_neither_from_its_deadline_nor_from_being_cancelled() -> (
     None
 ):

@@ -156,6 +156,7 @@ def test_no_delay_loss_doubling_or_reordering_makes_an_own_frame_a_strangers(
             assert not is_echo(echoes, Frame(0x752, bytes([content, 0])), place * 1e-3)
 
 
+@pytest.mark.slow
 @given(strategies.lists(strategies.integers(0, 3), max_size=60))
 def test_never_more_echoes_than_frames_sent_once_second_copies_are_too_late(
     contents: list[int],

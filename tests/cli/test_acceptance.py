@@ -64,6 +64,7 @@ def report() -> dict[str, Any]:
     return found
 
 
+@pytest.mark.slow
 def test_all_steps_pass_on_the_mock_and_are_called_practice(walk: Callable[..., Run]) -> None:
     run = walk("--yes", "--interrupt", "--json")
     assert run.code == 0
@@ -80,6 +81,7 @@ def test_all_steps_pass_on_the_mock_and_are_called_practice(walk: Callable[..., 
     assert "ended at packet" in walked["what"]
 
 
+@pytest.mark.slow
 def test_a_person_is_asked_before_anything_is_erased(
     walk: Callable[..., Run], answering: Callable[[Iterable[bool]], list[str]]
 ) -> None:
@@ -106,6 +108,7 @@ def test_another_device_than_the_label_says_ends_it(
     assert states(run.document)["first upgrade"] == "not tried"
 
 
+@pytest.mark.slow
 def test_ctrl_c_at_a_question_leaves_the_report(
     walk: Callable[..., Run], answering: Callable[[Iterable[bool]], list[str]]
 ) -> None:
@@ -117,6 +120,7 @@ def test_ctrl_c_at_a_question_leaves_the_report(
     assert "state of the BMS: it runs V1r0r4_20220512" in run.out
 
 
+@pytest.mark.slow
 def test_an_interruption_is_not_tried_without_a_request(walk: Callable[..., Run]) -> None:
     run = walk("--yes", "--json")
     assert run.code == 12
@@ -124,6 +128,7 @@ def test_an_interruption_is_not_tried_without_a_request(walk: Callable[..., Run]
     assert run.document["verdict"] == "incomplete"
 
 
+@pytest.mark.slow
 def test_ctrl_c_in_an_upgrade_leaves_the_report_and_the_state(
     walk: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -156,6 +161,7 @@ def test_without_a_terminal_or_agreement_it_is_refused(walk: Callable[..., Run])
     assert walk("--interrupt").code == 2
 
 
+@pytest.mark.slow
 def test_an_older_report_is_kept_unless_forced(walk: Callable[..., Run]) -> None:
     Path("acceptance-bms.json").write_text("kept")
     assert walk("--yes").code == 2
@@ -164,6 +170,7 @@ def test_an_older_report_is_kept_unless_forced(walk: Callable[..., Run]) -> None
     assert walk("--yes", "-o", "report.txt").code == 2
 
 
+@pytest.mark.slow
 def test_a_second_acceptance_with_the_same_new_report_is_refused_at_once(
     walk: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -188,6 +195,7 @@ def test_an_image_for_another_target_is_refused_and_no_check_is_waived(flasher: 
     assert not Path("acceptance-bms.html").exists()
 
 
+@pytest.mark.slow
 def test_a_target_without_queries_has_steps_that_cannot_be_tried(flasher: Flasher) -> None:
     words = ("acceptance", SAMPLES / "obc.bin", "-t", "obc", *MOCK, "--yes", "--interrupt")
     run = flasher(*words, "--json")
@@ -201,6 +209,7 @@ def test_a_target_without_queries_has_steps_that_cannot_be_tried(flasher: Flashe
     assert "NAK; what runs is not known" in run.err
 
 
+@pytest.mark.slow
 def test_a_check_of_the_device_that_refuses_names_no_option_to_waive_it(
     walk: Callable[..., Run], tmp_path: Path
 ) -> None:

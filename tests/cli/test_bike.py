@@ -162,6 +162,7 @@ def test_a_device_that_reports_the_version_of_the_set_is_left_alone_unless_force
     assert bike.erased == [OBC, WMC, BMS]
 
 
+@pytest.mark.slow
 def test_a_release_with_several_images_is_a_set(
     bike: BikeOnTheBus, flasher: Flasher, folder: Path
 ) -> None:
@@ -282,6 +283,7 @@ def test_a_stop_between_two_devices_leaves_the_next_one_as_it_was(
     assert run.err.splitlines()[-1].endswith("; OBC done, WMC not begun, BMS not begun")
 
 
+@pytest.mark.slow
 def test_a_device_that_fails_ends_the_bike_and_the_others_are_not_begun(
     upgrade: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -335,6 +337,7 @@ def test_a_silent_device_that_is_left_out_is_not_said_to_be_reset(
     assert "the OBC has sent nothing" not in run.err
 
 
+@pytest.mark.slow
 @each("place, erased", [((OBC, 6), [OBC]), ((WMC, 4), [OBC, WMC])])
 def test_another_bike_in_the_middle_is_refused_before_its_next_device_is_erased(
     upgrade: Callable[..., Run],
@@ -372,6 +375,7 @@ def test_devices_without_an_application_come_first_and_the_battery_before_the_ot
 # -- refused before anything is erased -------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_nearly_empty_battery_refuses_the_whole_bike(
     bike: BikeOnTheBus, upgrade: Callable[..., Run], tmp_path: Path
 ) -> None:
@@ -418,6 +422,7 @@ def test_another_version_than_the_set_states_is_refused(
     assert f"The image for the WMC is not the one of the set: it is {NEW}" in run.err
 
 
+@pytest.mark.slow
 def test_a_device_that_is_left_out_has_to_run_the_version_of_the_set(
     bike: BikeOnTheBus, upgrade: Callable[..., Run], folder: Path
 ) -> None:

@@ -36,6 +36,7 @@ def files_of(path: Path) -> dict[str, bytes]:
         return {name: archive.read(name) for name in archive.namelist()}
 
 
+@pytest.mark.slow
 def test_the_latest_failure_is_packed_with_its_story_history_and_adapters(
     flasher: Flasher, failure: Path, tmp_path: Path
 ) -> None:
@@ -85,6 +86,7 @@ def test_the_home_folder_is_not_in_it_but_added_bytes_stay_as_they_are(
     assert b"~/bms.hex" in files["report.json"]
 
 
+@pytest.mark.slow
 def test_nothing_is_overwritten_or_added_twice(
     flasher: Flasher, failure: Path, tmp_path: Path
 ) -> None:

@@ -64,6 +64,7 @@ class _Time:
         self.now_s += seconds
 
 
+@pytest.mark.slow
 def test_the_paced_mock_takes_the_time_that_the_plan_says(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -108,6 +108,7 @@ def test_all_codes_are_listed(flasher: Flasher) -> None:
     assert all(f"{code}  " in listed for code in (*ErrorCode, *CODES))
 
 
+@pytest.mark.slow
 def test_help_of_a_command_is_that_of_its_option(flasher: Flasher) -> None:
     assert flasher("help", "flash").out == flasher("flash", "--help").out
     assert flasher("help", "trust", "key").out == flasher("trust", "key", "--help").out

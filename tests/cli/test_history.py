@@ -66,6 +66,7 @@ def test_a_good_flash_is_kept_with_its_three_claims(flasher: Flasher, file: Path
         assert stat.S_IMODE(file.parent.stat().st_mode) == 0o700
 
 
+@pytest.mark.slow
 def test_what_runs_is_not_claimed_where_it_was_not_asked(flasher: Flasher) -> None:
     assert flasher("rescue", WMC, "-t", "wmc", *MOCK).code == ExitCode.OK
     kept = latest(flasher)
@@ -141,6 +142,7 @@ def full_disk(_file: Path, patch: pytest.MonkeyPatch) -> None:
     patch.setattr(os, "fsync", full)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("breaks", [broken_folder, full_disk])
 def test_what_cannot_be_written_is_a_warning_and_the_flash_goes_on(
     flasher: Flasher,
@@ -290,6 +292,7 @@ def test_a_pipe_in_its_place_is_not_waited_for(flasher: Flasher, file: Path) -> 
     assert flasher("history").code == ExitCode.USAGE
 
 
+@pytest.mark.slow
 def test_it_stays_bounded_and_keeps_the_latest(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(history, "SIZE_MAX", 4_000)
     file.parent.mkdir(parents=True)

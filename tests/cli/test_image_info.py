@@ -53,6 +53,7 @@ def pipe(monkeypatch: pytest.MonkeyPatch) -> Callable[[bytes], None]:
     return put
 
 
+@pytest.mark.slow
 @each("name", ["bms.hex", "wmc.s19", "obc.bin"])
 def test_an_image_is_read_from_standard_input_like_the_file(
     flasher: Flasher, pipe: Callable[[bytes], None], name: str
@@ -188,6 +189,7 @@ def test_without_a_target_the_plan_is_for_the_one_that_the_image_names(
     assert ("the image names it" in run.out) is (not more)
 
 
+@pytest.mark.slow
 def test_a_release_is_shown_by_another_command(flasher: Flasher, tmp_path: Path) -> None:
     release = tmp_path / "bike.wfw"
     words = ("--image", f"bms={SAMPLES / 'bms.hex'}", "--product", "48V", "--counter", "7")

@@ -174,6 +174,7 @@ def test_without_an_application_it_announces_itself_within_the_bicycle(
     assert 0x732 not in heard
 
 
+@pytest.mark.slow
 def test_faults_and_an_idle_shutdown_can_be_set(flasher: Flasher, serve: Serve) -> None:
     tool = Tool()
     serve(tool, 2000.0)

@@ -216,6 +216,7 @@ def test_ctrl_c_ends_it_with_exit_code_0() -> None:
     assert "Traceback" not in err
 
 
+@pytest.mark.slow
 def test_on_a_terminal_the_table_is_refreshed_without_erasing_anything(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -334,6 +335,7 @@ def test_what_has_no_room_is_counted() -> None:
     assert len(lines) <= 10
 
 
+@pytest.mark.slow
 @each("width", [40, 80, 116, 200])
 @each("height", [8, 10, 24, 60])
 def test_it_never_exceeds_the_window(width: int, height: int) -> None:

@@ -66,6 +66,7 @@ WORDS = ("-t", "bms", "-i", "virtual")
 # -- which upgrades count --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @each("command", ["flash", "rescue"])
 @each("ended", [None, BROKEN])
 def test_an_upgrade_without_an_end_or_with_a_bad_one_is_finished_by_the_same_command(
@@ -116,6 +117,7 @@ def seen_running() -> None:
     kept(ended=replace(UNTOUCHED, previous_version="V1r0r0_20220512"))
 
 
+@pytest.mark.slow
 @each(
     "remembers",
     [

@@ -318,6 +318,7 @@ def test_a_silent_device_leaves_a_bundle_that_is_explained(
     assert "The BMS did not answer." in told.out
 
 
+@pytest.mark.slow
 def test_an_existing_trace_file_is_overwritten_only_on_request(
     flasher: Flasher, short_bms: Path, tmp_path: Path
 ) -> None:

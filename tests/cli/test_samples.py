@@ -126,6 +126,7 @@ def test_no_station_begins_with_one(
         assert f"socket A, virtual {CHANNEL}" in run.err
 
 
+@pytest.mark.slow
 def test_the_bench_page_neither_offers_nor_sends_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -108,6 +108,7 @@ def test_what_only_the_manufacturer_may_write_is_reported_and_not_written(
     assert "1 warning" in run.out.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_another_unit_after_the_upgrade_gets_no_settings(
     battery: Settings, flash: Callable[..., Run]
 ) -> None:
@@ -285,6 +286,7 @@ def test_a_file_that_is_no_backup_is_refused(flasher: Flasher, tmp_path: Path) -
     assert "its format is 2" in flasher("backup", "restore", path, "--yes", "--mock").err
 
 
+@pytest.mark.slow
 def test_without_a_terminal_a_restore_needs_yes(flasher: Flasher, tmp_path: Path) -> None:
     path = tmp_path / "b.zip"
     mock = ("--mock", "--mock-speed", "0")

@@ -215,6 +215,7 @@ def test_a_campaign_that_tried_nothing_fails(
     assert "NOTHING TRIED: " in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_parts_of_the_sweep_are_listed_and_run(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["simulate", "sweep", "--list"]) == ExitCode.OK
     assert capsys.readouterr().out.startswith("frames ")

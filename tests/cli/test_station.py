@@ -503,6 +503,7 @@ def test_a_report_has_figures_on_stdout_and_files_for_others(
     assert "Flash certificate" in (tmp_path / "pages" / f"{SERIAL}.html").read_text("utf-8")
 
 
+@pytest.mark.slow
 def test_a_report_can_be_narrowed(flasher: Flasher, plant: Path) -> None:
     words = ("station", "report", "--database", plant, "--json")
     assert len(flasher(*words, "--serial", "W2605003").document["runs"]) == 1

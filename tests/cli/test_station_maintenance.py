@@ -176,6 +176,7 @@ def test_a_key_is_shown_rotated_and_replaced(
     assert "the key was declared lost" in verified.err
 
 
+@pytest.mark.slow
 def test_a_clock_is_released_by_a_person_with_a_reason(
     flasher: Flasher, bench: Bench, place: tuple[str, ...], schema: dict[str, Any]
 ) -> None:
@@ -190,6 +191,7 @@ def test_a_clock_is_released_by_a_person_with_a_reason(
     assert "Nothing is missing" in nothing.err
 
 
+@pytest.mark.slow
 def test_which_station_is_meant_has_to_be_clear(
     flasher: Flasher, bench: Bench, place: tuple[str, ...]
 ) -> None:
@@ -236,6 +238,7 @@ def test_records_of_an_older_schema_are_upgraded_once(
     assert flasher("station", "verify", *place).code == ExitCode.OK
 
 
+@pytest.mark.slow
 def test_rules_that_were_taken_away_hide_nothing_else(
     flasher: Flasher, bench: Bench, place: tuple[str, ...]
 ) -> None:

@@ -405,6 +405,7 @@ def sample(hint: Any) -> Any:
     return tuple(map(sample, options)) if options else sample_of(hint)
 
 
+@pytest.mark.slow
 @each("event", LINES)
 def test_every_event_is_as_described(event: Any) -> None:
     schema = json.loads(SCHEMA.read_text(encoding="utf-8"))

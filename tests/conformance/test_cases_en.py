@@ -106,6 +106,7 @@ def test_an_end_mark_that_is_refused_and_then_taken_fails() -> None:
     assert "complete" in failure.got
 
 
+@pytest.mark.slow
 @each("checksum", ("none", "crc32"))
 def test_a_good_image_of_the_user_is_padded_to_the_end_of_a_sector(checksum: str) -> None:
     device = replace(MOCK_PROFILE, image_checksum=checksum)  # type: ignore[arg-type]

@@ -141,6 +141,7 @@ def test_times_are_judged_all_together_and_tell_how_they_are_spread() -> None:
     assert names >= {"reset to first boot version", "end of transfer to complete"}
 
 
+@pytest.mark.slow
 def test_a_time_that_is_never_measured_is_no_pass() -> None:
     done = report("stays-in-bootloader", only=("TM-05",))
     assert failed(done) == []

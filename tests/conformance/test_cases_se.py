@@ -19,6 +19,7 @@ def test_the_mock_passes() -> None:
     assert not_passed(*CASES) == []
 
 
+@pytest.mark.slow
 def test_a_target_without_a_version_query_passes() -> None:
     assert not_passed("SE-03", "SE-04", target="wmc") == []
 

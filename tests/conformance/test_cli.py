@@ -219,6 +219,7 @@ def test_all_files_are_written_with_what_they_are_for(flasher: Flasher, tmp_path
     assert "boot version" in flasher("explain", trace, "--all").out
 
 
+@pytest.mark.slow
 def test_the_matrix_has_each_clause_with_its_cases_and_what_was_not_judged(
     flasher: Flasher, tmp_path: Path
 ) -> None:

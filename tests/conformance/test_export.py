@@ -121,6 +121,7 @@ def test_the_model_follows_the_choices_that_it_has() -> None:
     assert model.transfer_timeout_s == 2.5
 
 
+@pytest.mark.slow
 def test_nothing_failed(flasher: Flasher, tmp_path: Path) -> None:
     subject, path = "tests.peers.python_bootloader:PythonBootloader", tmp_path / "t.c"
     ran = flasher(

@@ -440,6 +440,7 @@ def test_a_device_that_is_not_there_is_told_and_nothing_is_asked() -> None:
     assert asked.stopped.startswith("before the first question, ")
 
 
+@pytest.mark.slow
 def test_one_that_is_stopped_has_its_good_image() -> None:
     subject, calls = mock(), []
 

@@ -150,6 +150,7 @@ def test_the_frames_of_an_own_test_that_failed_are_kept(pytester: pytest.Pyteste
     assert "752#55AA1607" in Path("traces/test_it.log").read_text()
 
 
+@pytest.mark.slow
 def test_markers_choose_cases_of_the_suite_and_a_wrong_device_fails_in_its_own(
     pytester: pytest.Pytester,
 ) -> None:
@@ -160,6 +161,7 @@ def test_markers_choose_cases_of_the_suite_and_a_wrong_device_fails_in_its_own(
     assert done.parseoutcomes()["failed"] == 1
 
 
+@pytest.mark.slow
 def test_power_and_readback_can_be_functions_of_a_conftest(pytester: pytest.Pytester) -> None:
     pytester.makeconftest(
         """
@@ -177,6 +179,7 @@ def test_power_and_readback_can_be_functions_of_a_conftest(pytester: pytest.Pyte
     done.stdout.fnmatch_lines(["*The mock has its own power control and readback.*"])
 
 
+@pytest.mark.slow
 def test_what_is_wrong_with_the_bench_is_told_without_a_traceback(
     pytester: pytest.Pytester,
 ) -> None:

@@ -230,6 +230,7 @@ class _RecordLast(MockDevice):
 _AFTER_BURST: dict[str, Value] = {"up_04_burst": "rejected"}
 
 
+@pytest.mark.slow
 @each("case_id", ("UP-02", "UP-06", "SE-04"))
 def test_wrong_update_commands_are_sent_when_the_device_listens(case_id: str) -> None:
     kind = type("Right", (ListensAfterBurst, RefusesByNak), {})

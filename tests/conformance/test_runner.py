@@ -134,6 +134,7 @@ def test_a_part_that_the_bench_cannot_do_is_said_and_the_rest_judged() -> None:
     assert status_of(only_said) is CaseVerdict.UNSUPPORTED
 
 
+@pytest.mark.slow
 def test_the_good_image_is_verified_by_what_there_is_and_the_report_says_how() -> None:
     def seen(target: str, *, readback: bool = False, address: int = 0) -> str:
         device = MockSubject(target)
@@ -413,6 +414,7 @@ def test_somebody_can_stop_the_run() -> None:
 # -- the report -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_report_and_chance_differs_by_case_and_repeat() -> None:
     drawn: list[int] = []
 
@@ -431,6 +433,7 @@ def test_the_same_seed_gives_the_same_report_and_chance_differs_by_case_and_repe
     assert twice("7") == twice("7")
 
 
+@pytest.mark.slow
 def test_a_message_that_is_delivered_in_one_go_takes_the_same_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -53,6 +53,7 @@ def test_what_differs_between_runs_is_shown_in_columns(
     assert "RS-01" in flasher("conformance", "compare", reports[0], reports[0], "-v").out
 
 
+@pytest.mark.slow
 def test_the_comparison_is_a_page_and_a_document_too(
     flasher: Flasher, reports: list[Path], tmp_path: Path
 ) -> None:

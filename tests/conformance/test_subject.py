@@ -217,6 +217,7 @@ def test_a_call_that_asks_its_hardware_for_ever_is_ended_and_is_a_finding(flaw: 
     assert "16 times its flash in one call" in text
 
 
+@pytest.mark.slow
 def test_the_controller_takes_three_frames_and_asks_for_more_when_it_has_room() -> None:
     with open_subject(
         _FLAWS + "SendsWithoutEnd", "bms", None, good_image=None, second_image=None
@@ -332,6 +333,7 @@ def test_what_is_written_to_the_pipe_and_is_no_message_is_said(tmp_path: Path) -
         _run(str(program), "RS-01")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
 @pytest.mark.parametrize(
     ("code", "said"),
@@ -381,6 +383,7 @@ def test_a_program_of_the_first_version_of_the_header_gets_its_answers(tmp_path:
     assert f"its last log lines: ({ord('k')}, 8, 105)" in _run(str(program), "RS-01").stopped
 
 
+@pytest.mark.slow
 def test_the_command_line_tests_it(flasher: Flasher) -> None:
     ran = flasher("conformance", "-t", "bms", "--subject", _HERE, "--case", "RS-01", "--json")
     assert ran.code == 0

@@ -169,6 +169,7 @@ class Babbler:
         return []
 
 
+@pytest.mark.slow
 @each("can_id", [0x001, 0x720, 0x7FF])
 def test_other_traffic_at_high_load_changes_nothing_but_the_time(can_id: int) -> None:
     """CO-01: a frame of 8 bytes takes about 0.5 ms; 70 % and more of the bus are taken."""

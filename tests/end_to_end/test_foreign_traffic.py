@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from flasher import api, events
 from flasher.errors import ExitCode
 from flasher.host.upgrade import Upgrade
@@ -100,6 +102,7 @@ def test_neighbours_of_our_ids_are_neither_taken_for_the_device_nor_for_a_second
     flash(Stage(), Speaker(*NEIGHBOURS, every_s=0.001))
 
 
+@pytest.mark.slow
 @each("can_id, load", [(0x001, 0.7), (0x723, 0.7), (0x7FF, 0.7), (0x001, 0.9)])
 def test_a_bus_that_others_use_to_70_percent_and_more_makes_it_slower_only(
     can_id: int, load: float

@@ -77,6 +77,7 @@ def test_without_knowing_of_the_session_it_stays_unreachable() -> None:
     assert "--in-session" in error.remedy
 
 
+@pytest.mark.slow
 @each("target", TARGETS)
 @each("packet", [1, 3, 4])
 @each("options", [OPEN, RESCUE, replace(OPEN, attempts=1)])

@@ -76,6 +76,7 @@ STRAYS_THAT_ARE_OVERCOME = [
 ]
 
 
+@pytest.mark.slow
 @each("script", STRAYS_THAT_ARE_OVERCOME)
 def test_the_host_copes_with_a_device_that_strays(script: DeviceScript) -> None:
     device = ScriptedDevice("bms", script)

@@ -179,6 +179,7 @@ def test_a_refusal_at_the_end_leaves_a_device_that_can_be_rescued() -> None:
 # -- the adapter ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.no_cover
 @each("number", SAMPLE)
 def test_an_adapter_that_fails_at_any_packet_is_exit_4_or_overcome(number: int) -> None:

@@ -114,6 +114,7 @@ def test_a_notebook_reads_a_trace_in_two_lines(trace: Path) -> None:
     assert table["running_information.voltage_mv"].mean() == 36_000
 
 
+@pytest.mark.slow
 def test_a_measurement_file_has_a_channel_for_each_number_and_flag(
     flasher: Flasher, trace: Path, tmp_path: Path
 ) -> None:

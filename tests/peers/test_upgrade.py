@@ -26,6 +26,7 @@ def test_an_upgrade_of_any_target_succeeds(target: str, size_bytes: int) -> None
     assert device.numbers("packet") == host.numbers("ack")
 
 
+@pytest.mark.slow
 def test_the_documents_image_of_78351_bytes_takes_613_packets() -> None:
     image = random.Random(78351).randbytes(78351)
     host, device = upgrade(image=image)

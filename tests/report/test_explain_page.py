@@ -114,6 +114,7 @@ def test_an_empty_trace_is_a_page_too() -> None:
     assert page.drawings == []
 
 
+@pytest.mark.slow
 def test_the_wall_time_is_shown_in_utc_and_nonsense_is_left_out() -> None:
     good = EVERY_KIND["good"]
     assert "from 2026-09-10 00:26:40 UTC on" in Page(render(good)).text

@@ -62,6 +62,7 @@ def test_values_that_no_tick_could_tell_apart_are_one_value() -> None:
     assert not wants_log([5e-324, 1])
 
 
+@pytest.mark.slow
 @given(positive, positive)
 def test_linear_ticks_hold_any_range_with_few_steps(one: float, other: float) -> None:
     low, high = min(one, other), max(one, other)
@@ -86,6 +87,7 @@ def test_a_logarithm_needs_positive_values_in_order(low: float, high: float) -> 
         log_ticks(low, high)
 
 
+@pytest.mark.slow
 @given(positive, positive)
 def test_log_ticks_hold_any_range(one: float, other: float) -> None:
     low, high = min(one, other), max(one, other)
@@ -134,6 +136,7 @@ def test_the_labels_of_an_axis_tell_neighbours_apart() -> None:
     assert labels == ["0", "0.2 s", "0.4 s", "0.6 s", "0.8 s", "1.0 s"]
 
 
+@pytest.mark.slow
 @given(st.lists(st.floats(0, 1000), min_size=2, max_size=9))
 def test_no_two_ticks_have_one_label(values: list[float]) -> None:
     axis = Axis.over(values, 0, 100)
@@ -148,6 +151,7 @@ def test_packet_numbers_have_round_ticks_after_the_first() -> None:
     assert [tuple(tick) for tick in whole_ticks(7, 7, 0, 100)] == [(7, 50)]
 
 
+@pytest.mark.slow
 @given(st.integers(0, 5000), st.integers(1, 200))
 def test_slices_are_all_of_it_in_nearly_equal_parts(count: int, most: int) -> None:
     parts = slices(count, most)

@@ -143,6 +143,7 @@ def test_what_is_left_out_of_a_dialogue_full_of_trouble_says_so() -> None:
     assert all("with trouble" in block.text and block.is_trouble for block in blocks)
 
 
+@pytest.mark.slow
 @given(st.lists(st.booleans(), max_size=400), st.integers(9, 60))
 def test_thinning_accounts_for_every_step(troubles: list[bool], most: int) -> None:
     items = [

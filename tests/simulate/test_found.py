@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from flasher.errors import ExitCode
 from flasher.simulate.plan import Plan
 from flasher.simulate.play import play
@@ -40,6 +42,7 @@ def test_ctrl_c_ends_the_wait_for_a_device_without_power() -> None:
 _TWO_DEVICES = "job packets=60 ; independent {0} ; independent answers=false {0}"
 
 
+@pytest.mark.slow
 @each(
     "choices, ending",
     [("", "completed, in_bootloader"), ("empty=listens", "completed, no_answer")],
@@ -54,6 +57,7 @@ def test_a_second_device_that_lost_its_application_needs_a_rescue(
     assert (verdict.ending, verdict.left) == (ending, "none / new")
 
 
+@pytest.mark.slow
 @each(
     "line",
     [
@@ -94,6 +98,7 @@ def test_frames_that_a_killed_process_left_in_its_adapter_are_those_of_a_host() 
     assert verdict.violations == ()
 
 
+@pytest.mark.slow
 @each(
     "line",
     [

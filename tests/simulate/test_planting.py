@@ -63,6 +63,7 @@ def test_a_mistake_is_in_the_process_until_the_end_of_its_block(bug: Bug) -> Non
     assert all(code is before[one] for one, code in codes_of(bug).items())
 
 
+@pytest.mark.slow
 @each("bug", [bug for bug in BUGS if len(bug.edits) > 1])
 def test_every_edit_of_a_mistake_changes_a_function(bug: Bug) -> None:
     for edit in bug.edits:

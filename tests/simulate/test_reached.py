@@ -92,6 +92,7 @@ def kill(_batch: Batch, _is_stopped: object = None) -> Result:
     raise SystemExit(3)
 
 
+@pytest.mark.slow
 def test_a_plan_of_the_corpus_that_ends_its_process_is_a_violation() -> None:
     found = run_alone(replace(corpus_batch(), first=1, count=1), run_one=kill)
     assert (found.runs, found.corpus_runs, found.violation_count) == (0, 1, 1)

@@ -49,6 +49,7 @@ def found(what: type, line: str) -> str:
     return str(violation)
 
 
+@pytest.mark.slow
 def test_a_right_bootloader_is_upgraded_and_a_line_replays_the_run() -> None:
     with bench_of(RIGHT) as bench:
         verdict = play(Plan.parse(f"{JOB} ; @packet2 drop count=3"), bench=bench)
@@ -57,6 +58,7 @@ def test_a_right_bootloader_is_upgraded_and_a_line_replays_the_run() -> None:
         assert play(Plan.parse(verdict.plan), bench=bench) == verdict
 
 
+@pytest.mark.slow
 def test_a_bootloader_begins_as_the_plan_says() -> None:
     with bench_of(RIGHT) as bench:
         for device in (
@@ -80,6 +82,7 @@ def test_a_power_cut_in_any_flash_operation_leaves_no_more_than_an_empty_device(
     assert sum(line.endswith("power") for line in lines) == len(cuts)
 
 
+@pytest.mark.slow
 def test_flash_that_reports_errors_is_no_success() -> None:
     fault = "@end flash-fails count=9"
     assert played(wrong_bootloaders.ReportsErrors, f"{JOB} ; {fault}").is_good
@@ -87,6 +90,7 @@ def test_flash_that_reports_errors_is_no_success() -> None:
     assert "FALSE: success, and the device has none" in map(str, wrong.violations)
 
 
+@pytest.mark.slow
 def test_what_the_flash_holds_is_what_is_started_after_a_power_up() -> None:
     with bench_of(wrong_bootloaders.ForgetsTheRecord) as bench:
         verdict = play(Plan.parse("job packets=3 ; subject application=none"), bench=bench)
@@ -96,6 +100,7 @@ def test_what_the_flash_holds_is_what_is_started_after_a_power_up() -> None:
     }
 
 
+@pytest.mark.slow
 def test_a_start_of_half_an_image_is_found() -> None:
     plan = Plan.parse(f"{JOB} ; @flash2 restart")
     with bench_of(wrong_bootloaders.TrustsTheRecord) as bench:
@@ -106,23 +111,27 @@ def test_a_start_of_half_an_image_is_found() -> None:
     assert second == first
 
 
+@pytest.mark.slow
 def test_a_crash_names_the_call_and_what_the_bootloader_printed() -> None:
     text = found(wrong_bootloaders.Crashes, "job packets=3 ; subject application=none")
     assert text.startswith("SUBJECT: the bootloader ended with status 1 in flasher_dut_receive")
     assert "ZeroDivisionError" in text
 
 
+@pytest.mark.slow
 def test_a_call_that_does_not_return_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process, "WATCHDOG_S", 0.3)
     text = found(wrong_bootloaders.Hangs, "job packets=3 ; subject application=none")
     assert "did not return from flasher_dut_receive" in text
 
 
+@pytest.mark.slow
 def test_a_bootloader_that_takes_no_application_is_a_finding_in_each_plan() -> None:
     text = found(wrong_bootloaders.Deaf, JOB)
     assert text.startswith("SUBJECT: its first upgrade, without faults, with -t bms, ends in ")
 
 
+@pytest.mark.slow
 def test_drawn_plans_have_the_bootloader_as_their_only_device() -> None:
     with bench_of(RIGHT) as bench:
         faults = 0
@@ -153,6 +162,7 @@ def test_the_key_of_a_campaign_depends_on_the_bootloader(tmp_path: Path) -> None
         run_batch(Batch(campaign_key(), 0, 1, subject=RIGHT, target="bms"))
 
 
+@pytest.mark.slow
 def test_a_bootloader_that_is_built_again_during_a_batch_ends_the_campaign(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -62,6 +62,7 @@ def test_the_parts_have_as_many_cases_as_they_report(monkeypatch: pytest.MonkeyP
         assert all(str(Plan.parse(text)) == text for text in sample)
 
 
+@pytest.mark.slow
 def test_the_pairs_are_of_all_frames_and_all_faults() -> None:
     number = len(INDEPENDENT.frames)
     pairs = next(each for each in parts() if each.name == "pairs")

@@ -101,6 +101,7 @@ def test_memory_stays_small_under_guesses_without_end() -> None:
         assert len(attempts._addresses) <= 1001
 
 
+@pytest.mark.slow
 @given(
     st.lists(st.tuples(st.floats(0.0, 90.0), st.sampled_from([X, Y]), st.booleans()), max_size=80)
 )

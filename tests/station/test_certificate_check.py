@@ -106,6 +106,7 @@ def test_a_certificate_in_another_language_is_checked(
     assert is_refused(plant, text.replace(f'lang="{language}"', 'lang="en"'))
 
 
+@pytest.mark.slow
 def test_its_signed_lines_alone_are_enough(plant: Bench) -> None:
     block = re.search(f"{MARKS[0]}.*?{MARKS[1]}", page(plant), re.DOTALL)
     assert block is not None
@@ -169,6 +170,7 @@ def test_carried_content_that_was_changed_is_reported(plant: Bench, what: str) -
     assert is_refused(plant, block[0])  # the lines alone, whatever the page says
 
 
+@pytest.mark.slow
 def test_a_certificate_signed_with_another_key_is_reported(plant: Bench, tmp_path: Path) -> None:
     key = SigningKey.make(tmp_path / "own.key")
     content = carried(page(plant))
@@ -185,6 +187,7 @@ def test_a_certificate_signed_with_another_key_is_reported(plant: Bench, tmp_pat
     assert found.problems == ("the run is not in these records",)
 
 
+@pytest.mark.slow
 def test_a_certificate_of_other_records_is_reported(plant: Bench, bench: Bench) -> None:
     bench.make(RunState.FAIL)
     bench.make()
@@ -192,6 +195,7 @@ def test_a_certificate_of_other_records_is_reported(plant: Bench, bench: Bench) 
     assert found.problems == ("the run is not in these records",)
 
 
+@pytest.mark.slow
 def test_records_that_were_changed_prove_nothing(bench: Bench) -> None:
     bench.make()
     text = page(bench)
@@ -202,6 +206,7 @@ def test_records_that_were_changed_prove_nothing(bench: Bench) -> None:
     assert any("the run itself" in each for each in checked(bench, text).problems)
 
 
+@pytest.mark.slow
 def test_a_later_run_of_the_unit_is_told(bench: Bench) -> None:
     bench.make(RunState.FAIL)
     text = page(bench)

@@ -37,6 +37,7 @@ def begun(line: LineBench) -> list[str]:
     return [each.serial for each in line.of(RunStarted)]
 
 
+@pytest.mark.slow
 def test_a_golden_unit_releases_this_flasher_with_this_recipe(bench: Bench) -> None:
     bench.use(TEXT)
     line = Requiring(bench)
@@ -62,6 +63,7 @@ def test_a_golden_unit_that_fails_releases_nothing(bench: Bench) -> None:
     assert bench.store.read.noted("line-2", AuditEvent.RELEASED) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["flasher", "recipe", "manifest"])
 def test_each_update_needs_a_golden_unit_again_and_going_back_does_not(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, what: str

@@ -85,6 +85,7 @@ def test_a_unit_that_has_passed_gets_its_label(bench: Bench) -> None:
     assert line.of(LabelPrinted) == [LabelPrinted("A", SERIAL)]
 
 
+@pytest.mark.slow
 @each("outcome, code", [(RunState.FAIL, "NO_ANSWER"), (RunState.ERROR, "BUS")])
 def test_another_verdict_gets_none(bench: Bench, outcome: RunState, code: str) -> None:
     printer = Printer(bench)
@@ -120,6 +121,7 @@ def test_no_label_before_the_pass_is_on_disk(bench: Bench, monkeypatch: pytest.M
     finished(line)
 
 
+@pytest.mark.slow
 def test_the_label_is_made_when_others_can_read_the_pass(bench: Bench) -> None:
     seen: list[str] = []
 
@@ -223,6 +225,7 @@ def test_a_template_that_fails_on_one_unit_is_said(bench: Bench) -> None:
     assert [event.serial for event in line.of(LabelPrinted)] == [SERIAL]
 
 
+@pytest.mark.slow
 def test_a_backlog_has_an_end(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(label_printer, "BACKLOG_MAX", 1)
     begun, goes_on = threading.Event(), threading.Event()
@@ -311,6 +314,7 @@ def test_what_is_not_audited_is_not_printed(bench: Bench, monkeypatch: pytest.Mo
     assert printer.came.empty()
 
 
+@pytest.mark.slow
 def test_units_that_did_not_pass_last_and_no_products_get_none(bench: Bench) -> None:
     bench.use(USUAL.replace("revision", 'duplicate = "reflash-with-reason"\nrevision', 1))
     bench.make()
@@ -454,6 +458,7 @@ def test_a_device_that_takes_nothing(tmp_path: Path) -> None:
     os.close(reader)
 
 
+@pytest.mark.slow
 def test_a_command(tmp_path: Path) -> None:
     made = tmp_path / "made"
     program = "import pathlib, sys; pathlib.Path(sys.argv[1]).write_bytes(sys.stdin.buffer.read())"

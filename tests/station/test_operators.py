@@ -368,6 +368,7 @@ def test_a_pin_that_does_not_come_is_not_waited_for(line: LineBench, bench: Benc
     assert line.last(ScanRefused).text == HIDDEN, "it came too late, and is not shown"
 
 
+@pytest.mark.slow
 @each("text", [SERIAL, OPERATOR, "SOCKET A", "RESUME", "", "12", "1" * 13, "no digits"])
 def test_what_is_no_pin_is_neither_tried_nor_shown_nor_done(bench: Bench, text: str) -> None:
     line = LineBench(bench, crew=crew())

@@ -97,6 +97,7 @@ def test_without_an_answer_the_pass_is_marked_everywhere(plant: Plant) -> None:
     assert plant.line.bench.store.examine().problems == ()
 
 
+@pytest.mark.slow
 def test_a_run_whose_claim_the_plant_released_is_marked_in_the_records(plant: Plant) -> None:
     plant.scan()
     plant.answer()

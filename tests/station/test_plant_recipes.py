@@ -214,6 +214,7 @@ def test_a_recipe_with_a_problem_is_loaded_again_and_offered_once_it_fits(bench:
 # -- between two units ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_run_finishes_with_the_recipe_that_it_began_with(plant: Plant) -> None:
     line = plant.line
     line.scan(OPERATOR)
@@ -289,6 +290,7 @@ def test_a_copy_that_is_damaged_in_use_is_named_as_the_plants(plant: Plant) -> N
     assert "fetched again" in refused.remedy
 
 
+@pytest.mark.slow
 def test_sockets_change_on_their_own(plant: Plant) -> None:
     digest = plant.give(REVISION_5, "B")
     plant.approve(digest)

@@ -81,6 +81,7 @@ def page(bench: Bench, serial: str) -> str:
     return render_certificate(life, now, proven(bench.store, life, now))
 
 
+@pytest.mark.slow
 def test_a_report_s_rows_are_the_runs(plant: Bench, report: Report) -> None:
     with plant.outsider() as connection:
         run_ids = connection.execute("SELECT id FROM run ORDER BY id").fetchall()
@@ -184,6 +185,7 @@ def test_a_junit_report_counts_failures_and_leaves_out_golden_units(report: Repo
     assert failure.get("message") == "<script>alert(1)</script>\\u202e\\x07"
 
 
+@pytest.mark.slow
 def test_a_report_of_a_filter_names_it(plant: Bench) -> None:
     report = Report(plant.store, RunFilter(lot="=L1"))
     assert len(report.runs) == 1
@@ -241,6 +243,7 @@ def test_the_code_on_the_paper_says_record_and_signed_row(
     assert 'class="qr"' in html
 
 
+@pytest.mark.slow
 def test_a_unit_that_did_not_pass_has_no_certificate(plant: Bench) -> None:
     html = page(plant, "W2605004")
     assert "Flash certificate" not in html
@@ -269,6 +272,7 @@ def test_only_what_has_limits_is_within_them(bench: Bench) -> None:
     assert page(bench, SERIAL).count(">within<") == 1
 
 
+@pytest.mark.slow
 def test_a_virtual_unit_has_no_certificate_and_is_marked_everywhere(bench: Bench) -> None:
     run_id = bench.make(is_virtual=True)
     html = page(bench, SERIAL)

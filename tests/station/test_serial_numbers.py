@@ -78,6 +78,7 @@ def test_the_ways_to_read_a_text_are_bounded() -> None:
         Pattern("(A|AA)" * 14)
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(
     st.lists(st.sampled_from(["A", "[AB]{0,3}", "A?", "(A|AA)", "A{1,2}", "."]), max_size=9),

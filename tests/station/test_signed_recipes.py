@@ -216,6 +216,7 @@ def test_a_release_that_is_exchanged_during_the_shift_is_a_changed_recipe(
     assert caught.value.refusal is Refusal.RECIPE_CHANGED
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("signature", "sentence"),
     [("required", "signed by"), ("waived", "waived by the recipe: the image is not signed")],
@@ -241,6 +242,7 @@ def test_record_and_certificate_state_who_signed_or_what_was_waived(
     assert check_certificate(bench.store, forged.encode()).problems
 
 
+@pytest.mark.slow
 def test_counters_are_those_of_the_serial_number_and_product_that_a_device_confirmed(
     bench: Bench, maker: Maker
 ) -> None:

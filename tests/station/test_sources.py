@@ -203,6 +203,7 @@ def test_two_people_at_one_source_never_get_each_others_unit(recipe: LoadedRecip
             assert sorted(floor.runs) == [("W1", "A"), ("W2", "B")], (one, two)
 
 
+@pytest.mark.slow
 def test_two_people_at_two_sources_disturb_each_other_in_no_order(recipe: LoadedRecipe) -> None:
     scans = [("SOCKET A", ONE), ("W1", ONE), ("SOCKET B", TWO), ("W2", TWO)]
     for order in itertools.permutations(scans):
@@ -349,6 +350,7 @@ def test_no_label_of_two_counts_alone_after_their_card_was_dropped(recipe: Loade
     assert floor.runs == [("W2", "A")]
 
 
+@pytest.mark.slow
 def test_a_dropped_card_is_forgotten_in_the_end(recipe: LoadedRecipe) -> None:
     floor = Floor(recipe)
     floor.put_all(*pair())

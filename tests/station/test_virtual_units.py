@@ -60,6 +60,7 @@ def test_the_next_number_comes_after_the_last_one_that_records_know(
     assert next_number(rule, set(known).intersection) == number
 
 
+@pytest.mark.slow
 def test_virtual_units_of_two_stations_of_a_plant_do_not_look_like_duplicates(
     tmp_path: Path,
 ) -> None:

@@ -213,6 +213,7 @@ def test_device_text_is_harmless() -> None:
     assert all(shown.text.isascii() and shown.text.isprintable() for shown in boot.fields)
 
 
+@pytest.mark.slow
 @given(
     st.lists(
         st.tuples(st.sampled_from([0x710, 0x720, 0x725, 0x752, 0x123]), st.binary(max_size=8)),

@@ -249,6 +249,7 @@ CAUSES: list[tuple[str, Callable[[Tape], object], Cause, Phase | None, int | Non
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @each(
     "write, cause, phase, packet",
     [row[1:] for row in CAUSES],
@@ -342,6 +343,7 @@ def test_every_message_is_a_line_when_everything_is_wanted() -> None:
     assert not any(isinstance(line, PacketRun) for line in upgrade.steps)
 
 
+@pytest.mark.slow
 def test_long_trouble_is_cut_in_the_middle_and_counted() -> None:
     tape = refused(Tape().to_packet(7), 700)
     (upgrade,) = told(tape).upgrades

@@ -44,6 +44,7 @@ def spoilt(chance: random.Random) -> list[tuple[float, Frame]]:
     return frames
 
 
+@pytest.mark.slow
 @each("seed", range(40))
 def test_a_spoilt_trace_has_a_story(seed: int) -> None:
     story = explain(spoilt(random.Random(seed)), source="x")

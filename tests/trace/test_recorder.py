@@ -204,6 +204,7 @@ def test_a_file_that_cannot_be_made_is_wrong_usage(tmp_path: Path) -> None:
         Recorder(tmp_path / "folder.asc")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", [NotImplementedError, ImportError])
 def test_a_format_whose_package_is_missing_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[Exception]

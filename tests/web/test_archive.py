@@ -76,6 +76,7 @@ def test_nothing_but_what_is_listed_is_given_out(
     assert "no longer exists" in answer.body.decode()
 
 
+@pytest.mark.slow
 def test_a_story_names_the_file_and_not_where_it_was_put(kept: Archive, tmp_path: Path) -> None:
     page = _asked(kept, "/kept/story", trace="a.log").body.decode()
     assert "What a.log tells" in page
@@ -97,6 +98,7 @@ def test_an_upgrade_without_an_end_names_what_it_left(kept: Archive) -> None:
     assert "its application is erased" in page
 
 
+@pytest.mark.slow
 def test_the_built_in_mock_is_named_in_the_language_of_the_page(kept: Archive) -> None:
     history = FlashHistory()
     history.begin(replace(BEGAN, adapter=MOCK))

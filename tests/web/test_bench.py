@@ -113,6 +113,7 @@ def test_it_is_kept_in_the_history_as_by_the_command(place: BenchPlace) -> None:
     assert flashes[-1].ended.running_version == NEW
 
 
+@pytest.mark.slow
 def test_an_upgrade_that_the_history_cannot_take_says_so(
     place: BenchPlace, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -124,6 +125,7 @@ def test_an_upgrade_that_the_history_cannot_take_says_so(
     assert done.warning.startswith("no history in ")
 
 
+@pytest.mark.slow
 @each(
     "target, serial, words",
     [
@@ -231,6 +233,7 @@ def test_an_image_that_changed_since_it_was_chosen_is_not_sent(
     assert state.done is None
 
 
+@pytest.mark.slow
 def test_an_order_from_a_page_that_was_not_up_to_date_sends_nothing(place: BenchPlace) -> None:
     shown = _chosen(place).selection
     image = order(BenchController.choose_image, IMAGE)
@@ -345,6 +348,7 @@ def test_a_check_that_refused_in_the_upgrade_is_waived_after_it(
 # -- bad ends --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("language", "text"),
     [
@@ -419,6 +423,7 @@ def test_a_bad_end_is_said_in_the_language_of_the_page(place: BenchPlace) -> Non
     assert "Zustand des Geräts: seine Anwendung" in german(error.remedy)
 
 
+@pytest.mark.slow
 def test_a_device_whose_upgrade_failed_is_rescued_with_the_same_image(place: BenchPlace) -> None:
     _done(place, BikeFault.POWER)
     state = place.do(BenchController.rescue_it)
@@ -469,6 +474,7 @@ def test_the_wait_for_a_lost_adapter_is_counted_down(place: BenchPlace) -> None:
     assert seen == [None, 5, 4, 3, 2, 1, None]
 
 
+@pytest.mark.slow
 def test_the_wait_for_the_power_is_counted_down(tmp_path: Path) -> None:
     ticks = itertools.count(0.0, 0.25)
     place = BenchPlace(tmp_path, lambda: next(ticks))
@@ -726,6 +732,7 @@ def test_the_file_that_came_last_replaces_the_selected_image(place: BenchPlace) 
     assert state.offer.name == "newer.bin"
 
 
+@pytest.mark.slow
 @each(
     "name, data",
     [
@@ -878,6 +885,7 @@ def test_a_silent_bus_has_something_to_do_on_the_page(place: BenchPlace) -> None
     assert without_options(trouble.remedy) == "Switch the system on."
 
 
+@pytest.mark.slow
 def test_after_a_rescue_no_check_denies_that_the_battery_reports_its_version(
     place: BenchPlace,
 ) -> None:
@@ -901,6 +909,7 @@ def test_a_message_without_options_is_the_same_and_one_of_options_alone_is_empty
 # -- settings --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_settings_are_kept_when_a_user_chooses_so(place: BenchPlace) -> None:
     state = _chosen(place)
     assert state.keeps_settings is False, "as the profile has it"

@@ -67,6 +67,7 @@ def outcome(state: BenchState) -> dict[str, str]:
     }
 
 
+@pytest.mark.slow
 def test_all_devices_are_upgraded_one_after_the_other_with_the_battery_last(
     place: BenchPlace,
 ) -> None:
@@ -84,6 +85,7 @@ def test_all_devices_are_upgraded_one_after_the_other_with_the_battery_last(
     assert state.offer.name == SET
 
 
+@pytest.mark.slow
 def test_after_a_stop_it_goes_on_with_the_device_where_it_stopped(place: BenchPlace) -> None:
     chosen(place)
 
@@ -128,6 +130,7 @@ def _exchange(place: BenchPlace) -> None:
         socket._device = socket._made()
 
 
+@pytest.mark.slow
 def test_another_bike_than_the_one_shown_gets_nothing(place: BenchPlace) -> None:
     chosen(place, BikeFault.EXCHANGED)
     _exchange(place)
@@ -142,6 +145,7 @@ def test_another_bike_than_the_one_shown_gets_nothing(place: BenchPlace) -> None
     assert set(outcome(upgraded(place)).values()) == {"done"}
 
 
+@pytest.mark.slow
 def test_another_bike_begins_again_and_the_first_one_goes_on(place: BenchPlace) -> None:
     chosen(place, BikeFault.EXCHANGED)
     bike = place.bikes._bikes[BikeFault.EXCHANGED.value]
@@ -171,6 +175,7 @@ def test_another_bike_begins_again_and_the_first_one_goes_on(place: BenchPlace) 
     assert [entry.target.name for entry in state.session[3:]] == ["obc", "wmc", "bms"]
 
 
+@pytest.mark.slow
 def test_a_battery_exchanged_in_the_last_moment_gets_nothing(place: BenchPlace) -> None:
     chosen(place, BikeFault.EXCHANGED)
     upgrade = place.bikes.upgrade
@@ -192,6 +197,7 @@ def test_a_battery_exchanged_in_the_last_moment_gets_nothing(place: BenchPlace) 
     assert state.done.packet == 0
 
 
+@pytest.mark.slow
 def test_an_adapter_lost_after_the_last_device_leaves_no_device_as_not_begun(
     place: BenchPlace,
 ) -> None:

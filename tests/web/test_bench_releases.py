@@ -63,6 +63,7 @@ def shown(place: BenchPlace, language: str) -> str:
     return "".join(page._parts(translator(language), place.bench.state).values())
 
 
+@pytest.mark.slow
 def test_a_release_is_offered_for_its_target_with_who_signed_it(
     place: BenchPlace, tmp_path: Path, maker: Maker
 ) -> None:
@@ -176,6 +177,7 @@ def test_an_unsigned_image_is_waived_like_any_check_and_recorded(
     assert IMAGE not in {name for name, each in judged(place).items() if not each.refusal}
 
 
+@pytest.mark.slow
 def test_an_older_release_than_the_device_received_is_refused(
     place: BenchPlace, tmp_path: Path, maker: Maker
 ) -> None:

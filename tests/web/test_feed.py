@@ -167,6 +167,7 @@ ANY = st.one_of(*map(st.from_type, OTHERS))
 EVENTS = st.lists(st.one_of(ANY, st.from_type(Progressed)).map(at_the_line), max_size=20)
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(EVENTS, st.sets(st.integers(0, 20), max_size=4))
 def test_a_page_that_was_open_shows_what_one_shows_that_is_opened_later(

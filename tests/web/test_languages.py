@@ -134,6 +134,7 @@ def test_no_adapter(place: BenchPlace) -> None:
     _check(_bench_pages(place, state), shows="The adapter cannot be opened")
 
 
+@pytest.mark.slow
 def test_a_silent_device(place: BenchPlace) -> None:
     state = place.do(_use(BikeFault.OFF))
     _check(_bench_pages(place, state), shows="No device of the drive system")
@@ -162,6 +163,7 @@ def _bit_rate(merged: Mapping[str, Any], _bench: BikeBench) -> object:
     return bit_rate(250_000, {}, merged)
 
 
+@pytest.mark.slow
 @each(
     "name, data, shows",
     [

@@ -55,6 +55,7 @@ def test_no_header_makes_another_client_of_one(port: int) -> None:
         assert asked(connection, header) == "http 127.0.0.1"
 
 
+@pytest.mark.slow
 def test_one_client_does_not_take_all_connections(
     port: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

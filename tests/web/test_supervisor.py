@@ -100,6 +100,7 @@ def _links(html: str) -> dict[str, str]:
     return parser.found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", ["/runs.csv", "/runs.csv?lot=L2", f"/images.csv?sha256={IMAGE}"])
 def test_a_file_in_parts_is_the_whole_file(
     client: TestClient, monkeypatch: pytest.MonkeyPatch, path: str
@@ -173,6 +174,7 @@ def test_pages_hold_every_run_once_in_both_directions(overview: Overview, size: 
     assert sorted({run for some in up for run in some}, reverse=True) == every
 
 
+@pytest.mark.slow
 def test_the_form_of_the_runs_narrows_them_and_its_files_are_of_the_same(
     client: TestClient,
 ) -> None:
@@ -224,6 +226,7 @@ def test_a_cut_that_cannot_be_is_none(client: TestClient, cut: str) -> None:
 # -- units -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_run_leads_to_its_unit_with_its_trace_explained(client: TestClient) -> None:
     answer = client.get(client.get("/runs/4").headers["location"])
     assert answer.status_code == 200
@@ -259,6 +262,7 @@ def test_what_is_not_there_is_said(client: TestClient, path: str) -> None:
     assert client.get(path).status_code == 404
 
 
+@pytest.mark.slow
 def test_the_certificate_is_refused_for_changed_records(bench: Bench) -> None:
     bench.make()
     client = client_of(app_of(bench.path, bench.keys))
@@ -286,6 +290,7 @@ def _flash(bench: Bench, serial: str, state: RunState, *, is_confirmed: bool = T
     return run_id
 
 
+@pytest.mark.slow
 def test_the_units_that_hold_an_image_are_those_it_was_last_sent_to(bench: Bench) -> None:
     overview = Overview(bench.store.database)
     _flash(bench, "W2605001", RunState.PASS)
@@ -360,6 +365,7 @@ def test_yield_counts_units_by_their_last_and_first_runs_in_each_span(overview: 
     assert (lot.units, lot.first_passed) == (3, 2)
 
 
+@pytest.mark.slow
 def test_more_spans_than_one_query_takes(overview: Overview) -> None:
     spans = [Span(BEGIN + timedelta(seconds=at), BEGIN + timedelta(seconds=at + 1))
              for at in range(900)]  # fmt: skip
@@ -409,6 +415,7 @@ def test_shifts_cover_a_time_and_are_named_by_their_begin() -> None:
     assert {name for _, name in found} == {"06:00", "14:00", "22:00"}
 
 
+@pytest.mark.slow
 def test_figures_are_of_the_last_days_that_have_runs(client: TestClient) -> None:
     html = client.get("/yield").text
     assert "2026-05-17 09:0" in html

@@ -52,6 +52,7 @@ def only(bench: Bench, chosen: RunFilter = RunFilter()) -> Capability:  # noqa: 
     return found
 
 
+@pytest.mark.slow
 def test_no_figure_is_rounded_to_an_exponent(bench: Bench) -> None:
     measure(bench, (1_499_999.0, 1_500_001.0), low=1_234_567.0, high=99_999_999.5)
     found = only(bench)
@@ -87,6 +88,7 @@ def test_values_outside_give_a_negative_index(bench: Bench) -> None:
     assert found.ppk == pytest.approx(-0.5 / (3 * DEVIATION), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_too_few_values_have_no_index(bench: Bench) -> None:
     measure(bench, VALUES[: VALUES_MIN - 1])
     found = only(bench)
@@ -135,6 +137,7 @@ def test_without_limits_there_is_none(bench: Bench) -> None:
     assert bench.store.read.capabilities() == []
 
 
+@pytest.mark.slow
 def test_json_and_csv_have_the_same_numbers(bench: Bench) -> None:
     measure(bench, [value - 12 for value in VALUES], low=-9.0)
     report = Report(bench.store, RunFilter(station="line-2"))

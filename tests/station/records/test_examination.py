@@ -64,6 +64,7 @@ def test_only_what_came_after_the_last_examination_is_examined(examined: Bench) 
     assert examined.store.examine().traces == 3
 
 
+@pytest.mark.slow
 def test_more_runs_are_no_more_statements(bench: Bench) -> None:
     """All rows of many runs are read together: an examination of a million runs asks for each page
     of the database about once.
@@ -85,6 +86,7 @@ def test_more_runs_are_no_more_statements(bench: Bench) -> None:
     assert len(reads) == 2, reads  # steps, and the measurements of steps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("statement", "where", "what"),
     [
@@ -200,6 +202,7 @@ def test_a_changed_run_is_reported_by_its_own_examination(
     assert any(what in each.what for each in found.problems), found.problems
 
 
+@pytest.mark.slow
 def test_a_run_of_a_chain_made_anew_is_reported_by_another_place(tmp_path: Path) -> None:
 
     bench = Bench(tmp_path, heads=(tmp_path / "share",))

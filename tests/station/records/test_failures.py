@@ -101,6 +101,7 @@ def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:
     assert path.read_bytes().startswith(b"this is")
 
 
+@pytest.mark.slow
 def test_a_damaged_page_is_found(bench: Bench) -> None:
     for number in range(2, 8):
         bench.make(serial=f"W260500{number}")

@@ -176,6 +176,7 @@ def to_pass(forger: Forger, folder: Path) -> None:
     forger.restate(3, folder, state="PASS")
 
 
+@pytest.mark.slow
 def test_a_fail_that_became_a_pass_in_a_recomputed_chain_is_told(
     plant: Bench, tmp_path: Path
 ) -> None:

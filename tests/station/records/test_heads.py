@@ -212,6 +212,7 @@ def test_a_crash_between_two_segments_spoils_nothing(
     assert faults_of(again(file)) == ([f"{new.name}: line 1 is not a head"] if left else [])
 
 
+@pytest.mark.slow
 def test_a_line_does_not_stop_at_any_size_of_its_heads(
     bench: Bench,
 ) -> None:

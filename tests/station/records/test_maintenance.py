@@ -18,6 +18,7 @@ from flasher.station.records.store import Store
 from tests.station.factory import SERIAL, Bench
 
 
+@pytest.mark.slow
 def test_a_backup_made_while_a_unit_runs_is_whole_and_opens_by_itself(bench: Bench) -> None:
     bench.make()
     bench.claim("W2605003")

@@ -134,6 +134,7 @@ FORGERIES: dict[Callable[[Bench], None], str] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("forge", FORGERIES)
 def test_what_was_forged_with_the_heads_beside_the_key_is_reported_by_another_place(
     line: Bench, tmp_path: Path, forge: Callable[[Bench], None]
@@ -154,6 +155,7 @@ def test_what_was_forged_with_the_heads_beside_the_key_is_reported_by_another_pl
     assert alone.unkept == ("line-2",)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("forge", FORGERIES)
 def test_no_station_goes_on_with_what_another_place_contradicts(
     line: Bench, forge: Callable[[Bench], None]
@@ -165,6 +167,7 @@ def test_no_station_goes_on_with_what_another_place_contradicts(
     assert "share" in caught.value.cause
 
 
+@pytest.mark.slow
 def test_rows_that_are_given_up_are_so_in_every_place(line: Bench) -> None:
     cut_tail(line)
     line.store = line.opened()
@@ -199,6 +202,7 @@ def test_heads_on_a_server_report_a_forgery_and_only_grow(postgres: Server, tmp_
     engine.dispose()
 
 
+@pytest.mark.slow
 def test_a_place_that_is_gone_stops_no_line_and_is_caught_up(tmp_path: Path) -> None:
     share, gone = tmp_path / "share", tmp_path / "gone"
     bench = Bench(tmp_path, heads=(share,))
@@ -270,6 +274,7 @@ def test_a_new_place_gets_the_heads_from_the_first_on(tmp_path: Path) -> None:
     assert verified(bench).is_checked_elsewhere
 
 
+@pytest.mark.slow
 def test_a_folder_in_which_an_older_flasher_kept_all_heads_goes_on(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     bench.make()

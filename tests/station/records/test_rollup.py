@@ -323,6 +323,7 @@ def made(bench: Bench) -> Lines:
     return Lines(bench.store.database, random.Random(1), runs=4)
 
 
+@pytest.mark.slow
 def test_a_day_that_goes_on_is_read_from_the_records(made: Lines, bench: Bench) -> None:
     now = bench.clock.now
     add_up(made, now)
@@ -331,6 +332,7 @@ def test_a_day_that_goes_on_is_read_from_the_records(made: Lines, bench: Bench) 
     assert summed_up_to(made) == 4
 
 
+@pytest.mark.slow
 def test_sums_end_before_a_run_that_goes_on(made: Lines, bench: Bench) -> None:
     run_id = bench.claim("W2605005").run_id
     bench.make(RunState.PASS, "W2605006", "B")
@@ -343,6 +345,7 @@ def test_sums_end_before_a_run_that_goes_on(made: Lines, bench: Bench) -> None:
     assert summed_up_to(made) == run_id + 1
 
 
+@pytest.mark.slow
 def test_sums_of_records_that_were_restored_are_made_anew(made: Lines, bench: Bench) -> None:
     backup = bench.folder / "backup.sqlite"
     bench.store.backup(backup)

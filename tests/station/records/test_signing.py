@@ -76,6 +76,7 @@ def test_a_key_of_something_else_or_for_everybody_is_refused(bench: Bench) -> No
         reopened(bench).recover()
 
 
+@pytest.mark.slow
 def test_after_a_rotation_another_key_signs_and_the_chain_holds(bench: Bench) -> None:
     bench.make()
     before = bench.store.signer.public
@@ -143,6 +144,7 @@ def test_heads_that_begin_late_leave_the_rows_before_unchecked(bench: Bench) -> 
     assert not found.kept[0].is_whole
 
 
+@pytest.mark.slow
 def test_an_older_copy_does_not_become_the_station_before_a_person_says_so(bench: Bench) -> None:
     bench.make()
     older = bench.folder / "older.sqlite"
@@ -181,6 +183,7 @@ def test_the_chains_of_two_stations_stand_for_themselves(bench: Bench) -> None:
 # -- the clock ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_clock_behind_the_last_record_begins_no_unit_until_a_person_releases_it(
     bench: Bench,
 ) -> None:

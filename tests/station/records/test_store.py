@@ -205,6 +205,7 @@ def test_a_lot_takes_no_more_units_than_it_has(bench: Bench) -> None:
     assert bench.claim("W2605006", "B", lot="L2").kind is RunKind.PRODUCTION
 
 
+@pytest.mark.slow
 def test_a_golden_unit_has_to_pass_on_each_socket_and_counts_in_no_figure(bench: Bench) -> None:
     bench.use(USUAL + GOLDEN)
     assert refusal(bench) is Refusal.GOLDEN_DUE
@@ -299,6 +300,7 @@ def test_a_connection_lost_in_a_transaction_leaves_the_run_as_it_was(bench: Benc
     assert not bench.store.examine().problems
 
 
+@pytest.mark.slow
 def test_threads_may_share_the_records(bench: Bench) -> None:
     bench.lock_timeout_s = 10.0
     bench.store.close()
@@ -318,6 +320,7 @@ def test_threads_may_share_the_records(bench: Bench) -> None:
 # -- figures --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_figures_tell_units_from_runs_and_first_tries_from_last(bench: Bench) -> None:
     bench.make(lot="L1")
     bench.make(RunState.FAIL, "W2605003", lot="L1", code="REFUSED")
