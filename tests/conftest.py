@@ -145,7 +145,6 @@ def pytest_collection_finish() -> None:
         from tests.station import statements  # noqa: PLC0415  needs the extra `plant`
 
         statements.share()
-    gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 20)  # there is memory for some garbage
     gc.enable()
