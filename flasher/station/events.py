@@ -51,7 +51,7 @@ class SocketState(LowerCaseInJson, StrEnum):
 
 
 @dataclass(frozen=True)
-class Timed:
+class StationEvent:
     """Base of all events."""
 
     at: str = field(default="", kw_only=True, compare=False)
@@ -59,7 +59,7 @@ class Timed:
 
 
 @dataclass(frozen=True)
-class StationStarted(Timed):
+class StationStarted(StationEvent):
     """The station is ready. `recovered`: runs that were active when the station died; they are
     INTERRUPTED now, and their units RECHECK.
     """
@@ -77,7 +77,7 @@ class StationStarted(Timed):
 
 
 @dataclass(frozen=True)
-class RecipeChanged(Timed):
+class RecipeChanged(StationEvent):
     """A socket uses another recipe from its next unit on."""
 
     socket: str
@@ -107,7 +107,7 @@ class OfferedRecipe:
 
 
 @dataclass(frozen=True)
-class RecipesOffered(Timed):
+class RecipesOffered(StationEvent):
     """The recipes that the plant offers, and those in use that it has withdrawn, changed."""
 
     offered: tuple[OfferedRecipe, ...]
@@ -116,7 +116,7 @@ class RecipesOffered(Timed):
 
 
 @dataclass(frozen=True)
-class SocketChanged(Timed):
+class SocketChanged(StationEvent):
     """The state or text of a socket changed."""
 
     socket: str
@@ -127,7 +127,7 @@ class SocketChanged(Timed):
 
 
 @dataclass(frozen=True)
-class UnitArrived(Timed):
+class UnitArrived(StationEvent):
     """A unit was put into the socket. `label`: label of a virtual unit; "" for a real one."""
 
     socket: str
@@ -136,14 +136,14 @@ class UnitArrived(Timed):
 
 
 @dataclass(frozen=True)
-class UnitRemoved(Timed):
+class UnitRemoved(StationEvent):
     """The unit was removed: it has sent nothing for the configured time."""
 
     socket: str
 
 
 @dataclass(frozen=True)
-class ScanAccepted(Timed):
+class ScanAccepted(StationEvent):
     """A scan was accepted: a label or a command (`flasher.station.scans`)."""
 
     text: str
@@ -155,7 +155,7 @@ class ScanAccepted(Timed):
 
 
 @dataclass(frozen=True)
-class ScanRefused(Timed):
+class ScanRefused(StationEvent):
     """A scan was refused without effect, or an accepted scan was dropped while it waited. `code` is
     stable; `remedy` is one action.
     """
@@ -170,7 +170,7 @@ class ScanRefused(Timed):
 
 
 @dataclass(frozen=True)
-class ScannerChanged(Timed):
+class ScannerChanged(StationEvent):
     """A scanner was connected or lost."""
 
     scanner: str
@@ -179,7 +179,7 @@ class ScannerChanged(Timed):
 
 
 @dataclass(frozen=True)
-class PinAwaited(Timed):
+class PinAwaited(StationEvent):
     """The next scan or typed line is this person's PIN: it must not be displayed."""
 
     person: str
@@ -189,7 +189,7 @@ class PinAwaited(Timed):
 
 
 @dataclass(frozen=True)
-class PinEnded(Timed):
+class PinEnded(StationEvent):
     """The station no longer waits for a PIN."""
 
     person: str
@@ -198,7 +198,7 @@ class PinEnded(Timed):
 
 
 @dataclass(frozen=True)
-class OperatorPrompted(Timed):
+class OperatorPrompted(StationEvent):
     """The operator has to act within `limit_s`, for example switch the unit off and on."""
 
     socket: str
@@ -209,7 +209,7 @@ class OperatorPrompted(Timed):
 
 
 @dataclass(frozen=True)
-class RunStarted(Timed):
+class RunStarted(StationEvent):
     """A run was claimed and is in the records."""
 
     socket: str
@@ -221,7 +221,7 @@ class RunStarted(Timed):
 
 
 @dataclass(frozen=True)
-class StepStarted(Timed):
+class StepStarted(StationEvent):
     """A step of the run begins. Tries count from 1; `target` is empty for a step of all targets."""
 
     socket: str
@@ -232,7 +232,7 @@ class StepStarted(Timed):
 
 
 @dataclass(frozen=True)
-class Progressed(Timed):
+class Progressed(StationEvent):
     """Progress of a step: `share` from 0 to 1; `left_s` is None when unknown."""
 
     socket: str
@@ -244,7 +244,7 @@ class Progressed(Timed):
 
 
 @dataclass(frozen=True)
-class StepEnded(Timed):
+class StepEnded(StationEvent):
     """One try of a step ended, and is in the records."""
 
     socket: str
@@ -265,7 +265,7 @@ class StepEnded(Timed):
 
 @json_keys("at socket serial run targets action")
 @dataclass(frozen=True)
-class RunEnded(Timed):
+class RunEnded(StationEvent):
     """A run has ended **and its outcome is on disk**: run and targets were read from there."""
 
     run: RunRecord
@@ -283,7 +283,7 @@ class RunEnded(Timed):
 
 
 @dataclass(frozen=True)
-class LabelPrinted(Timed):
+class LabelPrinted(StationEvent):
     """The label of a passed unit was sent to the printer."""
 
     socket: str
@@ -292,7 +292,7 @@ class LabelPrinted(Timed):
 
 
 @dataclass(frozen=True)
-class LabelFailed(Timed):
+class LabelFailed(StationEvent):
     """The label of a unit was not printed. The unit is still a PASS."""
 
     socket: str
@@ -302,7 +302,7 @@ class LabelFailed(Timed):
 
 
 @dataclass(frozen=True)
-class RecordNotSaved(Timed):
+class RecordNotSaved(StationEvent):
     """The outcome could not be saved: do not show a PASS. RESUME tries again."""
 
     socket: str
@@ -313,7 +313,7 @@ class RecordNotSaved(Timed):
 
 
 @dataclass(frozen=True)
-class LineStopped(Timed):
+class LineStopped(StationEvent):
     """The line was stopped: active runs are completed, and no run starts before RESUME."""
 
     code: str
@@ -322,12 +322,12 @@ class LineStopped(Timed):
 
 
 @dataclass(frozen=True)
-class LineResumed(Timed):
+class LineResumed(StationEvent):
     """The line was resumed by RESUME."""
 
 
 @dataclass(frozen=True)
-class WorkerFailed(Timed):
+class WorkerFailed(StationEvent):
     """The process of a socket ended or hung; a new one starts after `restart_in_s`."""
 
     socket: str
@@ -337,44 +337,14 @@ class WorkerFailed(Timed):
 
 
 @dataclass(frozen=True)
-class FiguresChanged(Timed):
+class FiguresChanged(StationEvent):
     """Totals of the recipe and lot since the station started."""
 
     figures: Figures
 
 
 @dataclass(frozen=True)
-class StationStopped(Timed):
+class StationStopped(StationEvent):
     """The station and all of its processes have ended."""
 
     station: str
-
-
-StationEvent = (
-    StationStarted
-    | RecipeChanged
-    | RecipesOffered
-    | SocketChanged
-    | UnitArrived
-    | UnitRemoved
-    | ScanAccepted
-    | ScanRefused
-    | ScannerChanged
-    | PinAwaited
-    | PinEnded
-    | OperatorPrompted
-    | RunStarted
-    | StepStarted
-    | Progressed
-    | StepEnded
-    | RunEnded
-    | LabelPrinted
-    | LabelFailed
-    | RecordNotSaved
-    | LineStopped
-    | LineResumed
-    | WorkerFailed
-    | FiguresChanged
-    | StationStopped
-)
-"""Every event of a station."""

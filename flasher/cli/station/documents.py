@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, get_args
+from typing import Final
 
 from flasher.station.events import ScanRefused, StationEvent
 from flasher.station.records.branch import BroughtIn
@@ -185,5 +185,5 @@ DOCUMENTS: Final = (
     PinDocument,
     Upgraded,
 )
-LINES: Final[tuple[type, ...]] = get_args(StationEvent)
+LINES: Final[tuple[type, ...]] = tuple(StationEvent.__subclasses__())
 """Events that a station prints as JSON lines."""
