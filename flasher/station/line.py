@@ -84,10 +84,14 @@ READ_S: Final = 2.0
 refusal."""
 NOTE_S: Final = 15.0
 """Time for which a socket shows that a card or label was dropped."""
-_RESUME: Final = Word.RESUME.value.lower()
-_REPRINT: Final = Word.REPRINT.value.lower()
-_RECIPE: Final = Word.RECIPE.value.lower()
 _PIN: Final = "pin"
+_REPORTED_LATER: Final = (
+    _PIN,
+    *(word.value.lower() for word in (Word.RESUME, Word.REPRINT, Word.RECIPE)),
+)
+"""Meanings of scans whose result other events report."""
+_STOPS_LINE: Final = (Refusal.RECIPE_CHANGED.value, Refusal.RECIPE_NOT_TRUSTED.value)
+"""Refused claims that stop the line."""
 _AGAIN: Final = text("Scan it again.")
 _NOTHING: Final = text("Nothing to do.")
 _CHANGED: Final = Refused(
@@ -106,16 +110,6 @@ def _dropped(reason: str, remedy: str = _AGAIN) -> Refused:
 
 
 @dataclass(frozen=True)
-class NotClaimed:
-    """The records refused the claim. `stops_line` stops the line."""
-
-    code: str
-    reason: str
-    remedy: str
-    stops_line: bool = False
-
-
-@dataclass(frozen=True)
 class NotSaved:
     """A part of the run could not be saved."""
 
@@ -128,13 +122,13 @@ SocketInput = (
     | AdapterDown
     | PresenceChanged
     | RunStarted
-    | NotClaimed
+    | Refused
     | RunResult
     | RunEnded
     | NotSaved
 )
-"""`RunStarted`: the claim is in the records. `RunResult`: the process has reported the end of the
-run. `RunEnded`: it is on disk."""
+"""`RunStarted`: the claim is in the records. `Refused`: it is not. `RunResult`: the process has
+reported the end of the run. `RunEnded`: it is on disk."""
 
 
 @dataclass(frozen=True)
@@ -160,20 +154,13 @@ class CheckPin:
 
 
 @dataclass(frozen=True)
-class Reprint:
-    """Record `data`, then print the label of a passed unit again; then call `Line.reprinted`."""
-
-    serial: str
-    data: Mapping[str, str]
-
-
-@dataclass(frozen=True)
-class ApproveRecipe:
-    """Record `data` for the offered recipe whose digest begins with `digits`, then use it; then
-    call `Line.recipe_approved`.
+class DoCommand:
+    """Record `data` and carry a command out; then call `Line.done`. REPRINT prints the label of a
+    passed unit again, RECIPE uses the offered recipe whose digest begins with the argument.
     """
 
-    digits: str
+    word: Word
+    argument: str
     data: Mapping[str, str]
 
 
@@ -206,8 +193,7 @@ Effect = (
     | SaveAgain
     | AbortRun
     | CheckPin
-    | Reprint
-    | ApproveRecipe
+    | DoCommand
     | Audit
     | StationEvent
 )
@@ -403,12 +389,12 @@ class Line:
                 each.interrupted = ""
         self._reasons.pop(socket.serial, None)
 
-    def _not_claimed(self, socket: Socket, what: NotClaimed, _now: float) -> None:
+    def _not_claimed(self, socket: Socket, why: Refused, _now: float) -> None:
         serial, socket.phase, socket.serial = socket.serial, SocketPhase.REST, ""
-        self._refuse(serial, Refused(what.code, what.reason, what.remedy), socket, socket.source)
-        socket.note = text("{reason} {remedy}", reason=what.reason, remedy=what.remedy)
-        if what.stops_line:
-            self.stop(what.code, what.reason, what.remedy)
+        self._refuse(serial, why, socket, socket.source)
+        socket.note = text("{reason} {remedy}", reason=why.reason, remedy=why.remedy)
+        if why.code in _STOPS_LINE:
+            self.stop(why.code, why.reason, why.remedy)
 
     def _claim_failed(self, socket: Socket, what: NotSaved, _now: float) -> None:
         socket.phase, socket.serial = SocketPhase.REST, ""
@@ -489,7 +475,7 @@ class Line:
         except Refused as refused:
             self._refuse(shown, refused, source=source)
         else:
-            if meaning not in (_RESUME, _REPRINT, _RECIPE, _PIN):  # other events report the result
+            if meaning not in _REPORTED_LATER:
                 name = "" if socket is None else socket.name
                 self._emit(ScanAccepted(shown, meaning, name, source.name))
 
@@ -818,15 +804,8 @@ class Line:
 
     def _reprint(self, argument: str, _now: float, _waiting: Waiting) -> None:
         self._crew.check_assigned()
-        self._effects.append(Reprint(argument, self._with_author({"serial": argument})))
-
-    def reprinted(self, serial: str, refused: Refused | None) -> None:
-        """Process the result of `Reprint`."""
-        text = printable(f"{Word.REPRINT.value} {serial}")[:80]
-        if refused is None:
-            self._emit(ScanAccepted(text, _REPRINT))
-        else:
-            self._refuse(text, refused)
+        data = self._with_author({"serial": argument})
+        self._effects.append(DoCommand(Word.REPRINT, argument, data))
 
     def _approve_recipe(self, argument: str, _now: float, _waiting: Waiting) -> None:
         if not self._crew.has_badges:
@@ -835,13 +814,13 @@ class Line:
                 text("No person can be identified: this station has no badge table."),
                 text("Name the badge table in the station file."),
             )
-        self._effects.append(ApproveRecipe(argument, self._with_author({})))
+        self._effects.append(DoCommand(Word.RECIPE, argument, self._with_author({})))
 
-    def recipe_approved(self, digits: str, refused: Refused | None) -> None:
-        """Process the result of `ApproveRecipe`."""
-        text = printable(f"{Word.RECIPE.value} {digits}")[:80]
+    def done(self, command: DoCommand, refused: Refused | None) -> None:
+        """Process the result of `DoCommand`."""
+        text = printable(f"{command.word.value} {command.argument}")[:80]
         if refused is None:
-            self._emit(ScanAccepted(text, _RECIPE))
+            self._emit(ScanAccepted(text, command.word.value.lower()))
         else:
             self._refuse(text, refused)
 
@@ -857,7 +836,7 @@ class Line:
         word = Word.RESUME.value
         if all_saved:
             self.stopped = None
-            self._emit(ScanAccepted(word, _RESUME))
+            self._emit(ScanAccepted(word, word.lower()))
             self._emit(LineResumed())
             for socket in self.sockets.values() if self._scans_labels else ():
                 if socket.awaits_label and socket.virtual_label:  # it was refused meanwhile
@@ -1078,7 +1057,7 @@ class Line:
         SocketPhase.REST: {AdapterReady: _ready, AdapterDown: _down, PresenceChanged: _unit},
         SocketPhase.CLAIM: {
             RunStarted: _claimed,
-            NotClaimed: _not_claimed,
+            Refused: _not_claimed,
             NotSaved: _claim_failed,
         },
         SocketPhase.RUN: {

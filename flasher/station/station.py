@@ -418,19 +418,14 @@ class Station:
                     case line.CheckPin(pin, pin_hash):
                         checked = self.checker.submit(pins.is_right, pin, pin_hash)
                         checked.add_done_callback(self._pin_checked)
-                    case line.Reprint() | line.ApproveRecipe():
-                        self._do_asked(effect)
+                    case line.DoCommand(word, argument, data):
+                        do = self._reprint if word is Word.REPRINT else self._approve
+                        self.line.done(effect, do(argument, data))
+                        self._change_recipes()
                     case line.Audit(what, data):
                         self._audit(what, data)
                     case _:
                         self.emit(effect)
-
-    def _do_asked(self, asked: line.Reprint | line.ApproveRecipe) -> None:
-        if isinstance(asked, line.Reprint):
-            self.line.reprinted(asked.serial, self._reprint(asked.serial, asked.data))
-        else:
-            self.line.recipe_approved(asked.digits, self._approve(asked.digits, asked.data))
-            self._change_recipes()
 
     def _process_message(self, socket: str, message: FromWorker | WorkerLost) -> None:
         match message:
@@ -644,7 +639,7 @@ class Station:
             rows = self.store.read.noted(self.store.station, AuditEvent.RELEASED)
             self._released = {_release_key(data) for data in rows}
 
-    def _needs_golden(self, order: Order) -> line.NotClaimed | None:
+    def _needs_golden(self, order: Order) -> Refused | None:
         """The refusal of a unit before a golden unit has passed; None if it may begin."""
         if not self.options.needs_golden:
             return None
@@ -659,7 +654,7 @@ class Station:
             version=__version__,
         )
         remedy = text("Scan and connect one of: {serials}.", serials=", ".join(serials))
-        return line.NotClaimed(Refusal.GOLDEN_DUE.value, reason, remedy)
+        return Refused(Refusal.GOLDEN_DUE.value, reason, remedy)
 
     def _note_golden(self, socket: str, claim: Claim) -> None:
         """Record the PASS of a golden unit, which releases this flasher with its recipe."""
@@ -685,7 +680,7 @@ class Station:
         refused = self._needs_golden(order)
         if refused is None and recipe.digest in self._offers.withdrawn:
             reason = text("The plant has withdrawn the recipe of this socket.")
-            refused = line.NotClaimed(Refusal.RECIPE_WITHDRAWN.value, reason, _OTHER_RECIPE)
+            refused = Refused(Refusal.RECIPE_WITHDRAWN.value, reason, _OTHER_RECIPE)
         if refused is not None:
             self._gate.dropped(order.admission)
             return refused
@@ -694,8 +689,7 @@ class Station:
             claim = self.store.claim(order, recipe)
         except ClaimRefusedError as error:
             self._gate.dropped(order.admission)
-            stops_line = error.refusal in (Refusal.RECIPE_CHANGED, Refusal.RECIPE_NOT_TRUSTED)
-            return line.NotClaimed(error.refusal.value, error.what, error.remedy, stops_line)
+            return Refused(error.refusal.value, error.what, error.remedy)
         except RecordError as error:
             self._gate.ended(order.admission)  # whether a run began is not known
             return self._not_saved(socket, order.serial, None, error)

@@ -25,6 +25,7 @@ from flasher.station.events import (
 from flasher.station.line import Line
 from flasher.station.messages import AdapterDown, AdapterReady, PresenceChanged
 from flasher.station.records.model import Admission, Order, RunState
+from flasher.station.scans import Refused
 from flasher.station.socket import Binding, Socket
 from tests.station.line_inputs import RESULT, begun, saved
 
@@ -187,12 +188,10 @@ class World:
                     case (
                         line.AbortRun()
                         | line.CheckPin()
-                        | line.Reprint()
+                        | line.DoCommand()
                         | line.Audit()
                         | line.DropAdmission()
                     ):
-                        pass
-                    case line.ApproveRecipe():
                         pass
                     case _:
                         self.look(effect)
@@ -201,7 +200,7 @@ class World:
         if not self.disk_works:
             self.line.feed(socket, line.NotSaved("full", "Make room."), self.now)
         elif self.runs.get(label) is RunState.PASS:
-            what = line.NotClaimed("DUPLICATE", "It has passed before.", "Put it aside.")
+            what = Refused("DUPLICATE", "It has passed before.", "Put it aside.")
             self.line.feed(socket, what, self.now)
         else:
             bay = self.bays[socket]
