@@ -148,6 +148,8 @@ class Copying:
         self._key = key
         self._retry_s = retry_s
         self._position: Position | None = None
+        self._last: ChainHead | None = None
+        """The last head that was copied to the place."""
         self._known = source.path.with_name(f"{source.path.name}.places")
         self._wake, self._is_ending = threading.Event(), False
         self._idle = threading.Event()
@@ -197,7 +199,8 @@ class Copying:
                 return
 
     def _copy(self) -> None:
-        if self._position is None:
+        # The place may be another one since: a share that was unmounted, or an older copy of it.
+        if self._position is None or self._target.last() != self._last:
             self._position = self._find()
         some: list[ChainHead] = []
         for head, position in self._source.since(self._position):
@@ -210,7 +213,7 @@ class Copying:
 
     def _put(self, some: list[ChainHead], position: Position) -> None:
         self._target.append(some, self._key())
-        self._position = position
+        self._position, self._last = position, some[-1]
         self._note_known()
 
     def _note_known(self) -> None:

@@ -4,6 +4,7 @@ cannot be reached stops no line.
 
 from __future__ import annotations
 
+import json
 import pickle
 import shutil
 from collections.abc import Callable, Iterator
@@ -246,6 +247,28 @@ def test_a_share_that_is_not_mounted_is_not_begun_anew(tmp_path: Path) -> None:
     assert copying.wait()
     assert "another share may be mounted" in copying.fault
     assert not list(share.iterdir())
+
+
+def test_a_share_that_is_unmounted_meanwhile_is_not_begun_anew(tmp_path: Path) -> None:
+    mounted, away = tmp_path / "mounted", tmp_path / "away"
+    bench = Bench(tmp_path, heads=(mounted / "heads",))
+    bench.make()
+    (copying,) = bench.store.signer.copies
+    assert copying.wait()
+    shutil.move(mounted, away)
+    mounted.mkdir()
+    bench.make(serial=OTHER)
+    assert copying.wait()
+    assert "another share may be mounted" in copying.fault
+    assert not list(mounted.iterdir())
+    mounted.rmdir()
+    shutil.move(away, mounted)
+    bench.make(serial="W2605004")
+    assert copying.wait()
+    assert not copying.fault
+    (kept,) = (mounted / "heads").glob("*.heads")
+    numbers = [json.loads(line)["number"] for line in kept.read_text("ascii").splitlines()]
+    assert numbers == list(range(1, 9))
 
 
 def test_a_place_that_was_never_reached_is_begun_when_it_can_be(tmp_path: Path) -> None:
