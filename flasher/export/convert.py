@@ -30,14 +30,14 @@ class Converted:
     """Place and reason at which reading stopped; empty at the end of the trace."""
 
 
-def convert(trace: Path, to: Path, *, name: Path) -> Converted:
-    """Write a trace in the format of `to`'s suffix; messages call it `name`. Raises UsageError,
-    and OSError when the disk is full.
+def convert(trace: Path, to: Path, *, name: Path, channel: str | None = None) -> Converted:
+    """Write a trace, or one channel of it, in the format of `to`'s suffix; messages call it `name`.
+    Raises UsageError, and OSError when the disk is full.
     """
     remarks: dict[_Place, list[str]] = {}
     writer: Writer
     if to.suffix.lower() == ".pcapng":
-        story = explain_path(trace, everything=True)
+        story = explain_path(trace, everything=True, channel=channel)
         remarks = _remarks(story)
         verdict = story.verdict
         parts = (verdict.text, verdict.likely, verdict.remedy)
@@ -49,7 +49,7 @@ def convert(trace: Path, to: Path, *, name: Path) -> Converted:
     start: float | None = None
     now = -math.inf
     try:
-        for at, frame in frames_until_damage(trace_file(trace), damage):
+        for at, frame in frames_until_damage(trace_file(trace), damage, channel=channel):
             now = max(now, at)
             start = now if start is None else start
             # Each is written once: frames accepted together have the same time.
@@ -67,15 +67,16 @@ def convert(trace: Path, to: Path, *, name: Path) -> Converted:
     return Converted(frames, remarked, " ".join(damage))
 
 
-def convert_joined(trace: Path, to: Path, *, name: Path) -> Converted:
-    """Write each intact message of a trace as one CAN FD frame, as the DBC describes them. Raises
-    UsageError and OSError like `convert`.
+def convert_joined(trace: Path, to: Path, *, name: Path, channel: str | None = None) -> Converted:
+    """Write each intact message of a trace, or of one channel of it, as one CAN FD frame, as the
+    DBC describes them. Raises UsageError and OSError like `convert`.
     """
     damage: list[str] = []
     frames = 0
     writer = writer_of(to, name=str(name))
     try:
-        for message in joined_frames(frames_until_damage(trace_file(trace), damage)):
+        frames_read = frames_until_damage(trace_file(trace), damage, channel=channel)
+        for message in joined_frames(frames_read):
             writer(message)
             frames += 1
     finally:

@@ -24,7 +24,7 @@ from flasher.protocol.spec import (
 from flasher.protocol.text import printable
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.trace.decoder import BusEvent, Kind, TimedDecoder, TimedEvent, bits_of, route
-from flasher.trace.observed_upgrade import ObservedUpgrade
+from flasher.trace.observed_upgrade import NEXT_UPGRADE_S, ObservedUpgrade, values_of
 from flasher.trace.steps import MAX_STEPS, StepList, mark_unanswered, step_of
 from flasher.trace.story import (
     BusFigures,
@@ -118,6 +118,8 @@ class _StoryBuilder:
         self._outside = self._new_steps()
         self._announced: dict[Target, list[TimedEvent]] = {}
         """Latest boot versions that no tool has answered yet."""
+        self._identified = "", float("-inf")
+        """Serial number of the battery that answered last outside an upgrade, and when."""
         self._announcements = 0
         self._has_hmi = False
         self._has_nodes = False
@@ -188,6 +190,9 @@ class _StoryBuilder:
             max_packets=self._packets_left,
             is_one_tool=self._is_one_tool,
         )
+        serial_number, answered_at_s = self._identified
+        if target is BMS and timed.begin_s - answered_at_s <= NEXT_UPGRADE_S:
+            upgrade.serial_number = serial_number
         for message in heard:
             upgrade.device(message)
         return upgrade
@@ -227,9 +232,11 @@ class _StoryBuilder:
             if event.command == Command.VERSION_INFORMATION:
                 self._end_of_restart(BMS, timed)
             battery = self._open.get(BMS)
-            if event.command == Command.VERSION_INFORMATION and battery is not None:
-                battery.version(timed)
-                return
+            if event.command == Command.VERSION_INFORMATION:
+                if battery is not None:
+                    battery.version(timed)
+                    return
+                self._identified = str(values_of(event)["serial_number"]), timed.end_s
             if event.command == _SHUTDOWN:
                 for upgrade in self._open.values():
                     upgrade.shutdown(timed)

@@ -151,6 +151,10 @@ class ObservedUpgrade:
     """Boot versions after complete."""
     early_complete: bool = False
     running_version: str | None = None
+    serial_number: str = ""
+    """Serial number that the application answered before the upgrade or first after it."""
+    other_serial_number: str = ""
+    """Serial number of another unit that answered after the end."""
 
     # Others.
     shutdown_at_s: float | None = None
@@ -179,11 +183,13 @@ class ObservedUpgrade:
     def begins_another(self, event: BusEvent) -> bool:
         """True if a message of the tool belongs to the next upgrade."""
         is_over = self.completed_at_s is not None or self.early_complete
+        is_later = event.at - self.last_at_s > NEXT_UPGRADE_S
         if event.command == Command.RESET:
-            return is_over or event.at - self.last_at_s > NEXT_UPGRADE_S
+            return is_over or is_later
         if event.command == Command.UPDATE:
             return self.completed_at_s is not None
-        return False
+        # A series: the tool identifies the next unit.
+        return is_later and self.completed_at_s is not None and self.running_version is not None
 
     def tool(self, timed: TimedEvent) -> None:
         """Record an event with the CAN id of the tool's messages to the target."""
@@ -221,9 +227,16 @@ class ObservedUpgrade:
 
     def version(self, timed: TimedEvent) -> None:
         self.steps.add(step_of(timed.event, timed.end_s))
-        if self.ends:
+        values = values_of(timed.event)
+        serial_number = str(values["serial_number"])
+        if not self.ends:
+            self.serial_number = self.serial_number or serial_number
+        elif self.serial_number and serial_number not in ("", self.serial_number):
+            self.other_serial_number = serial_number
+        else:
             self._enter(Phase.CONFIRM, timed.begin_s)
-            self.running_version = str(values_of(timed.event)["firmware_version"])
+            self.serial_number = serial_number
+            self.running_version = str(values["firmware_version"])
             self.last_at_s = timed.end_s
 
     def shutdown(self, timed: TimedEvent) -> None:

@@ -61,13 +61,24 @@ _LINE_READERS: Final = {
 }
 _CAPTURES: Final = (".pcap", ".pcapng")
 _OTHERS: Final = (".blf", ".db", ".mf4", *_CAPTURES)
+_FIRST_CHANNEL: Final = {".asc": 1, ".blf": 1}
+"""Number in the file of the channel that python-can calls 0."""
+_CHANNELS_MAX: Final = 100
 
 
-def read_trace(path: str | os.PathLike[str]) -> Iterator[tuple[float, Frame]]:
-    """Yield time in seconds and frame, in file order, without CAN FD frames.
+class SeveralBusesError(UsageError):
+    """The trace is right, but not of one CAN bus."""
+
+
+def read_trace(
+    path: str | os.PathLike[str], *, channel: str | None = None
+) -> Iterator[tuple[float, Frame]]:
+    """Yield time in seconds and frame, in file order, without CAN FD frames; of a `channel` as the
+    file names it, or of all.
 
     Times are those of the file: seconds since its start or since 1970. Raises UsageError for a file
-    that cannot be opened, whose suffix is unknown, or whose content does not match the suffix.
+    that cannot be opened, whose suffix is unknown, or whose content does not match the suffix, and
+    SeveralBusesError for one with the frames of several buses.
     """
     shown = printable(os.fspath(path))
     suffixes = [suffix.lower() for suffix in Path(path).suffixes]
@@ -85,10 +96,12 @@ def read_trace(path: str | os.PathLike[str]) -> Iterator[tuple[float, Frame]]:
                 source = gzip.GzipFile(fileobj=file)
                 check_unpacked(iter(partial(source.read, _PIECE_SIZE), b""), size)
                 source.seek(0)
-            for at_s, frame in _frames(suffix, source, size, Path(path), bounds):
+            one = _OneBus(suffix, channel)
+            for at_s, frame in _frames(suffix, source, size, Path(path), bounds, one):
                 _check(at_s, frame)
                 bounds.frames += 1
                 yield at_s, frame
+            one.check_found()
         except NotImplementedError as error:
             raise UsageError(
                 f"{shown}: this trace format needs a package that is not installed.",
@@ -102,7 +115,8 @@ def read_trace(path: str | os.PathLike[str]) -> Iterator[tuple[float, Frame]]:
             reason = "" if isinstance(error, UnfitError) else f"{type(error).__name__}: "
             remedy = error.remedy if isinstance(error, UnfitError) else ""
             wrong = f"{shown} is not a trace of the format that its suffix says."
-            raise UsageError(
+            kind = SeveralBusesError if remedy else UsageError
+            raise kind(
                 f"{shown} is not a trace of one CAN bus." if remedy else wrong,
                 where=f"after frame {bounds.frames:,}" if bounds.frames else "at its beginning",
                 cause=printable(f"{reason}{error!s:.100}"),
@@ -110,8 +124,45 @@ def read_trace(path: str | os.PathLike[str]) -> Iterator[tuple[float, Frame]]:
             ) from error
 
 
+class _OneBus:
+    """Chooses the frames of one channel. Without a choice, an id on two channels shows two buses;
+    programs that write what they send and receive to two channels use each id on one.
+    """
+
+    def __init__(self, suffix: str, chosen: str | None) -> None:
+        self._first = _FIRST_CHANNEL.get(suffix, 0)
+        self._chosen = chosen
+        self._of_id: dict[int, str] = {}
+        self._names: dict[str, None] = {}
+
+    def takes(self, message: can.Message) -> bool:
+        """True for a frame to read. Raises UnfitError for an id on a second channel."""
+        channel = message.channel
+        name = str(channel + self._first if isinstance(channel, int) else channel)
+        if len(self._names) < _CHANNELS_MAX:
+            self._names.setdefault(name)
+        if self._chosen is not None:
+            return name == self._chosen
+        is_payload = not (message.is_extended_id or message.is_error_frame)
+        if is_payload and self._of_id.setdefault(message.arbitration_id, name) != name:
+            names = [self._of_id[message.arbitration_id], name]
+            raise UnfitError(
+                f"id {message.arbitration_id:03X} is on the channels {' and '.join(names)}",
+                remedy=f"Keep one: flasher export trace FILE --channel {names[0]} -o ONE.log",
+            )
+        return True
+
+    def check_found(self) -> None:
+        """Raise UnfitError if no frame is of the chosen channel."""
+        if self._chosen is not None and self._chosen not in self._names:
+            raise UnfitError(
+                f"it has no frame of the channel {self._chosen}",
+                remedy=f"Name one of these: {', '.join(self._names) or 'none'}.",
+            )
+
+
 def _frames(
-    suffix: str, source: BufferedIOBase, size: int, path: Path, bounds: Bounds
+    suffix: str, source: BufferedIOBase, size: int, path: Path, bounds: Bounds, one: _OneBus
 ) -> Iterator[tuple[float, Frame]]:
     """Yield the frames from the format's reader. Raises any exception of that reader."""
     if suffix == ".db":
@@ -137,7 +188,8 @@ def _frames(
             )
         )
     for message in filter(is_classic, reader):
-        yield message.timestamp, frame_of(message)
+        if one.takes(message):
+            yield message.timestamp, frame_of(message)
 
 
 def _check(at_s: float, frame: Frame) -> None:

@@ -14,7 +14,7 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.text import printable
 from flasher.trace.bundle import OLDER_TRACE, REPORT, TRACE
 from flasher.trace.explain import explain
-from flasher.trace.reader import read_trace
+from flasher.trace.reader import SeveralBusesError, read_trace
 from flasher.trace.recorder import ONE_TOOL_CHANNEL
 from flasher.trace.story import Cause, Recorded, Story, TraceVerdict
 from flasher.wording import explanation
@@ -23,8 +23,14 @@ _HEAD_SIZE: Final = 100
 _RATE_MAX_BPS: Final = 10_000_000
 
 
-def explain_path(path: Path, *, bitrate_bps: int | None = None, everything: bool = False) -> Story:
-    """Explain a trace file of any known format, or the folder of a bundle.
+def explain_path(
+    path: Path,
+    *,
+    bitrate_bps: int | None = None,
+    everything: bool = False,
+    channel: str | None = None,
+) -> Story:
+    """Explain a trace file of any known format, or one channel of it, or the folder of a bundle.
 
     Raises UsageError for other files and folders.
     """
@@ -35,7 +41,7 @@ def explain_path(path: Path, *, bitrate_bps: int | None = None, everything: bool
     if not isinstance(rate_bps, int) or not 0 < rate_bps <= _RATE_MAX_BPS:
         rate_bps = None
     story = explain(
-        frames_until_damage(trace, damage),
+        frames_until_damage(trace, damage, channel=channel),
         source=str(path),
         suffix=_suffix(trace),
         bitrate_bps=bitrate_bps or rate_bps,
@@ -86,15 +92,20 @@ def _with_tool_end(story: Story) -> Story:
     return replace(story, upgrades=tuple(upgrades), verdict=judged(story.verdict))
 
 
-def frames_until_damage(path: Path, damage: list[str]) -> Iterator[tuple[float, Frame]]:
+def frames_until_damage(
+    path: Path, damage: list[str], *, channel: str | None = None
+) -> Iterator[tuple[float, Frame]]:
     """Yield the frames up to the first unreadable one, which is described in `damage`: a killed
-    recorder leaves half a line. Raises UsageError if no frame can be read.
+    recorder leaves half a line. Raises UsageError if no frame can be read, or if the frames are of
+    several buses.
     """
     count = 0
     try:
-        for timed in read_trace(path):
+        for timed in read_trace(path, channel=channel):
             yield timed
             count += 1
+    except SeveralBusesError:
+        raise
     except UsageError as error:
         if not count:
             raise

@@ -278,6 +278,7 @@ def remarks(upgrade: ObservedUpgrade, cause: Cause) -> tuple[str, ...]:
         found.append(f"packets with an ACK too many: {upgrade.extra_acks}")
     if names and upgrade.target.boot_name not in names and cause is not Cause.WRONG_DEVICE:
         found.append(f"boot name is {', '.join(sorted(names))}, not {upgrade.target.boot_name}")
+    found += _of_another_unit(upgrade)
     if upgrade.shutdown_at_s is not None and cause is not Cause.SHUTDOWN:
         found.append("the battery sent SHUTDOWN in the meantime")
     if upgrade.intrusions and cause is not Cause.SECOND_TOOL:
@@ -291,3 +292,10 @@ def remarks(upgrade: ObservedUpgrade, cause: Cause) -> tuple[str, ...]:
     if upgrade.end_naks and cause is not Cause.REFUSED:
         found.append(f"the end of the transfer was refused {times(upgrade.end_naks)}")
     return tuple(found)
+
+
+def _of_another_unit(upgrade: ObservedUpgrade) -> list[str]:
+    other, own = upgrade.other_serial_number, upgrade.serial_number
+    if not other:
+        return []
+    return [f"another unit answers after the end: serial number {other}, not {own}"]

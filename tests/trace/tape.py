@@ -107,8 +107,9 @@ class Tape:
     def complete(self) -> Tape:
         return self.device(0xC502, bytes(2))
 
-    def version(self, firmware: bytes) -> Tape:
-        fields = b"BM36.           W2605001.       V1r2r0_20220512." + (firmware + b".").ljust(16)
+    def version(self, firmware: bytes, serial: bytes = b"W2605001") -> Tape:
+        texts = (b"BM36", serial, b"V1r2r0_20220512", firmware)
+        fields = b"".join((text + b".").ljust(16) for text in texts)
         return self.message(0x720, REPORT, 0x1540, fields)
 
     def shutdown(self) -> Tape:

@@ -406,6 +406,32 @@ def test_a_bus_that_was_listened_to_longer_tells_more_than_its_last_frame() -> N
     assert told(tape, until=tape.now + 5).verdict.cause is Cause.TOOL_STOPPED
 
 
+def test_the_next_unit_of_a_series_does_not_judge_the_one_before() -> None:
+    tape = Tape()
+    for serial in (b"W1", b"W2", b"W3"):
+        tape.tool(0x3300, b"", READ).version(OLD, serial).wait(0.1)
+        with_version(tape).complete().wait(0.3).tool(0x3300, b"", READ).version(NEW, serial)
+        tape.wait(40)
+    story = told(tape.tool(0x3300, b"", READ).version(OLD, b"W4"))
+    assert [upgrade.verdict.cause for upgrade in story.upgrades] == [Cause.COMPLETED] * 3
+    assert [upgrade.running_version for upgrade in story.upgrades] == [NEW.decode()] * 3
+    assert all(upgrade.end_s - upgrade.begin_s < 1 for upgrade in story.upgrades)
+    assert [upgrade.remarks for upgrade in story.upgrades] == [()] * 3
+
+
+@pytest.mark.parametrize("begins", [Tape().version(OLD, b"W1"), Tape().reset().version(OLD, b"W1")])
+def test_a_version_answer_of_another_unit_is_no_verification(begins: Tape) -> None:
+    (upgrade,) = told(with_version(begins).complete().wait(0.3).version(NEW, b"W2")).upgrades
+    assert upgrade.verdict.cause is Cause.COMPLETED
+    assert upgrade.running_version is None
+    assert upgrade.remarks == ("another unit answers after the end: serial number W2, not W1",)
+
+
+def test_a_unit_that_falls_back_later_is_still_judged_by_its_last_answer() -> None:
+    tape = with_version(Tape().version(OLD)).complete().wait(0.3).version(NEW).wait(5).version(OLD)
+    assert told(tape).verdict.cause is Cause.OTHER_VERSION
+
+
 def test_hostile_texts_come_out_escaped() -> None:
     story = told(Tape().reset().feedback().boot(b"\x1b[2J\r\n"))
     assert story.verdict.cause is Cause.WRONG_DEVICE

@@ -15,8 +15,9 @@ import pytest
 
 from flasher.errors import ExitCode, UsageError
 from flasher.protocol.frame import Frame
-from flasher.trace.reader import read_trace
+from flasher.trace.reader import SeveralBusesError, read_trace
 from flasher.trace.recorder import Recorder
+from flasher.trace.source import frames_until_damage
 from tests.trace import traffic
 
 
@@ -55,6 +56,46 @@ def test_can_fd_frames_are_left_out(tmp_path: Path) -> None:
         logger(can.Message(arbitration_id=0x720, data=bytes(12), is_fd=True, is_extended_id=False))
         logger(can.Message(arbitration_id=0x720, data=b"ab", is_extended_id=False))
     assert [frame.data for _, frame in read_trace(path)] == [b"ab"]
+
+
+@pytest.mark.parametrize(
+    ("suffix", "names"),
+    [(".asc", "12"), (".blf", "12"), (".log", ("can0", "can1")), (".trc", "12")],
+)
+def test_two_buses_in_a_trace_are_not_read_as_one(
+    tmp_path: Path, suffix: str, names: tuple[str, str]
+) -> None:
+    path = tmp_path / f"two{suffix}"
+    with can.Logger(path) as logger:
+        for channel, can_id in ((0, 0x752), (1, 0x725), (0, 0x720), (1, 0x720), (1, 0x721)):
+            logger(
+                can.Message(
+                    arbitration_id=can_id, data=b"ab", channel=channel, is_extended_id=False
+                )
+            )
+    with pytest.raises(SeveralBusesError, match="not a trace of one CAN bus") as caught:
+        list(frames_until_damage(path, []))
+    assert f"id 720 is on the channels {names[0]} and {names[1]}" in caught.value.cause
+    assert f"--channel {names[0]} " in caught.value.remedy
+    assert [frame.can_id for _, frame in read_trace(path, channel=names[0])] == [0x752, 0x720]
+    assert [frame.can_id for _, frame in read_trace(path, channel=names[1])] == [
+        0x725, 0x720, 0x721,
+    ]  # fmt: skip
+    with pytest.raises(SeveralBusesError) as caught:
+        list(read_trace(path, channel="9"))
+    assert f"{names[0]}, {names[1]}" in caught.value.remedy
+
+
+def test_what_one_program_writes_to_a_channel_for_each_direction_is_one_bus(tmp_path: Path) -> None:
+    path = tmp_path / "script.log"
+    with can.Logger(path) as logger:
+        for channel, can_id in ((None, 0x752), ("can3", 0x725), (None, 0x752)):
+            logger(
+                can.Message(
+                    arbitration_id=can_id, data=b"ab", channel=channel, is_extended_id=False
+                )
+            )
+    assert [frame.can_id for _, frame in read_trace(path)] == [0x752, 0x725, 0x752]
 
 
 def test_a_missing_file_is_wrong_usage(tmp_path: Path) -> None:

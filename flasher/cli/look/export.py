@@ -78,6 +78,7 @@ examples:
   flasher export trace upgrade.asc -o upgrade.pcapng     for Wireshark, with comments
   flasher export trace upgrade.pcapng -o upgrade.log     for canplayer, log2asc and tshark
   flasher export trace capture.pcapng -o upgrade.blf     for CANalyzer
+  flasher export trace two.blf --channel 2 -o bike.log   one of two buses
   flasher export trace upgrade.asc --joined -o joined.asc
                                                          for a program with the DBC
 
@@ -190,13 +191,17 @@ def dbc(output: Output, *, file: Path | None) -> int:
     "--joined", is_flag=True, brief=True,
     help="each intact message as one CAN FD frame, as the DBC has them; nothing else",
 )  # fmt: skip
-def trace(output: Output, *, trace: Path, file: Path, joined: bool) -> int:
+@option(
+    "--channel", metavar="NAME",
+    help="only frames of this channel, where the trace has several (can1; in .asc and .blf 1, 2)",
+)  # fmt: skip
+def trace(output: Output, *, trace: Path, file: Path, joined: bool, channel: str | None) -> int:
     """Write a recorded trace in another format."""
     from flasher.export.convert import convert, convert_joined  # noqa: PLC0415  loads python-can
 
     check_not_read(file, _OUT, [trace])
     with writing(file, _OUT) as part:
-        made = (convert_joined if joined else convert)(trace, part, name=file)
+        made = (convert_joined if joined else convert)(trace, part, name=file, channel=channel)
     shown = f"{printable(str(file))}: {counted(made.frames, 'frame')}"
     output.result(f"{shown}, {counted(made.remarks, 'remark')}" if made.remarks else shown)
     _warn(output, trace, made.damage, made=made.frames)
