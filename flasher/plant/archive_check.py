@@ -18,8 +18,9 @@ from flasher.plant.archive import ArchivedChain, ArchiveReader, Manifest, Rows
 from flasher.plant.schema import OWN_PARTS, SHARED_PARTS, kept_run
 from flasher.protocol.text import printable
 from flasher.station.records import chain
+from flasher.station.records.database import Database
 from flasher.station.records.errors import RecordsDamagedError
-from flasher.station.records.examination import ExaminedTrail, Examiner, Readable, RunDigests
+from flasher.station.records.examination import ExaminedTrail, Examiner, RunDigests
 from flasher.station.records.files import FileStore
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import Problem, RunDetails, RunId, WriteId
@@ -132,7 +133,7 @@ class ArchiveExaminer(AssembledExaminer):
 
     def __init__(
         self,
-        database: Readable,
+        database: Database,
         path: Path,
         chains: Sequence[ArchivedChain],
         progress: Callable[[int, int], None],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Final
@@ -15,7 +16,7 @@ from flasher.errors import ErrorCode, UsageError
 from flasher.plant.functions import REFUSED
 from flasher.plant.schema import PLANT_SCHEMA, VERSION_TABLE
 from flasher.protocol.text import printable
-from flasher.station.records.database import Location, locate, server_engine
+from flasher.station.records.database import Database, Location, locate
 from flasher.station.records.errors import RuleBrokenError, mapped
 
 LOCK_TIMEOUT_S: Final = 10.0
@@ -94,8 +95,10 @@ def plant_location(url: str) -> Location:
     return location
 
 
-class Central:
-    """The plant's database. Each method raises RecordError, ChainRefusedError."""
+class Central(Database):
+    """The plant's database, with statements for its owner and its stations. Each method raises
+    RecordError, ChainRefusedError.
+    """
 
     def __init__(
         self,
@@ -105,19 +108,15 @@ class Central:
         statement_limit_s: float | None = None,
         lock_timeout_s: float = LOCK_TIMEOUT_S,
     ) -> None:
-        self.location = plant_location(url)
-        address = (
-            self.location.url if database is None else self.location.url.set(database=database)
-        )
-        self._engine = server_engine(address, lock_timeout_s, statement_limit_s)
+        location = plant_location(url)
+        if database is not None:
+            location = replace(location, url=location.url.set(database=database))
+        super().__init__(location, lock_timeout_s, statement_limit_s=statement_limit_s)
 
     @property
     def shown(self) -> str:
         """URL for messages, without a password."""
         return self.location.shown
-
-    def close(self) -> None:
-        self._engine.dispose()
 
     def check_schema(self) -> None:
         """Check that the tables are those of this flasher. Raises UsageError, RecordError."""
@@ -144,25 +143,9 @@ class Central:
             )
 
     @contextmanager
-    def reading(self) -> Iterator[Connection]:
-        """Open a read transaction with one consistent snapshot."""
-        with self._mapped(writes=False), self._engine.connect() as connection:
-            connection.execution_options(
-                isolation_level="REPEATABLE READ", postgresql_readonly=True
-            )
-            with connection.begin():
-                yield connection
-
-    @contextmanager
-    def writing(self) -> Iterator[Connection]:
-        """Open a transaction; committed when the block ends without an error."""
-        with self._mapped(writes=True), self._engine.begin() as connection:
-            yield connection
-
-    @contextmanager
     def outside_transaction(self) -> Iterator[Connection]:
         """Connect in autocommit mode, for what a transaction cannot do."""
-        with self._mapped(writes=True), self._engine.connect() as connection:
+        with self._mapped(writes=True), self.engine.connect() as connection:
             yield connection.execution_options(isolation_level="AUTOCOMMIT")
 
     @contextmanager

@@ -12,7 +12,7 @@ import os
 import re
 import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
@@ -24,7 +24,6 @@ from filelock import FileLock, Timeout
 from sqlalchemy import Connection, Engine, create_engine, event, inspect, select
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError
-from sqlalchemy.pool import StaticPool
 
 from flasher.errors import ErrorCode, UsageError, how_to_install
 from flasher.protocol.text import printable
@@ -69,9 +68,7 @@ class Location:
     @property
     def file(self) -> Path | None:
         """Path of the SQLite file; None for a server."""
-        name = self.url.database
-        is_file = self.url.get_backend_name() == "sqlite" and name not in (None, "", ":memory:")
-        return Path(str(name)) if is_file else None
+        return Path(str(self.url.database)) if self.url.drivername == "sqlite" else None
 
 
 def locate(url: str, folder: Path | None = None) -> Location:
@@ -89,6 +86,8 @@ def locate(url: str, folder: Path | None = None) -> Location:
     # An @ or a / of a password that is not written as %40 or %2F lands in host or name.
     if parsed.drivername not in ("sqlite", _POSTGRESQL) or "@" in f"{parsed.host}{parsed.database}":
         raise _no_database(url)
+    if backend == "sqlite" and parsed.database in (None, "", ":memory:"):
+        raise _no_database(url)  # in memory no PASS would be on disk
     if backend == "sqlite" and parsed.query:
         raise UsageError(
             f"The database {shown} has options in its URL; records use none.",
@@ -141,11 +140,14 @@ class Database:
         *,
         read_only: bool = False,
         changes_schema: bool = False,
+        statement_limit_s: float | None = None,
     ) -> None:
+        """`statement_limit_s`: of a server; None: its default."""
         self.location = location
         self._read_only = read_only
         self._changes_schema = changes_schema
         self._lock_timeout_ms = max(1, round(lock_timeout_s * 1000))
+        self._statement_limit_s = statement_limit_s
         self.engine = self._engine()
 
     @contextmanager
@@ -153,7 +155,7 @@ class Database:
         """Open a write transaction, one at a time; it is on disk when the block ends without an
         error. Raises RecordError: then nothing was saved.
         """
-        with mapped(self.location.shown, writes=True), self.engine.connect() as bare:
+        with self._mapped(writes=True), self.engine.connect() as bare:
             connection = bare.execution_options(**{_IMMEDIATE: True})
             self._check_place(bare)
             with connection.begin():
@@ -163,10 +165,7 @@ class Database:
     @contextmanager
     def reading(self) -> Iterator[Connection]:
         """Open a read transaction with one consistent snapshot. Raises RecordError."""
-        with (
-            mapped(self.location.shown, writes=False),
-            self.engine.connect() as connection,
-        ):
+        with self._mapped(writes=False), self.engine.connect() as connection:
             if self.engine.dialect.name == "postgresql":
                 connection.execution_options(
                     isolation_level="REPEATABLE READ", postgresql_readonly=True
@@ -195,18 +194,18 @@ class Database:
     def close(self) -> None:
         self.engine.dispose()
 
+    def _mapped(self, *, writes: bool) -> AbstractContextManager[None]:
+        """Map the errors of a block to RecordErrors."""
+        return mapped(self.location.shown, writes=writes)
+
     def _engine(self) -> Engine:
-        if self.location.url.get_backend_name() != "sqlite":
-            return server_engine(self.location.url, self._lock_timeout_ms / 1000)
-        options: dict[str, Any] = {"connect_args": {"timeout": self._lock_timeout_ms / 1000}}
-        if self.location.file is None:
-            options = {
-                "poolclass": StaticPool,
-                "connect_args": {"check_same_thread": False},
-            }
-        elif self._read_only:
-            options["creator"] = partial(read_only_sqlite, self.location.file)
-        engine = create_engine(self.location.url, **options)
+        url, file, timeout_s = self.location.url, self.location.file, self._lock_timeout_ms / 1000
+        if file is None:
+            return _server_engine(url, timeout_s, self._statement_limit_s)
+        options: dict[str, Any] = {"connect_args": {"timeout": timeout_s}}
+        if self._read_only:
+            options["creator"] = partial(read_only_sqlite, file)
+        engine = create_engine(url, **options)
         event.listen(engine, "connect", self._prepare_sqlite)
         event.listen(engine, "begin", _begin_sqlite)
         return engine
@@ -223,7 +222,7 @@ class Database:
         wanted = {
             # The busy timeout comes first: changing the journal needs the lock.
             "busy_timeout": self._lock_timeout_ms,
-            "journal_mode": "memory" if self.location.file is None else "wal",
+            "journal_mode": "wal",
             "synchronous": _SYNCHRONOUS_FULL,
             # Alembic replaces a table to change it, while other rows refer to its rows.
             "foreign_keys": 0 if self._changes_schema else 1,
@@ -274,9 +273,7 @@ class StationLock:
         self._lock.release(force=True)
 
 
-def server_engine(
-    url: URL, lock_timeout_s: float, statement_limit_s: float | None = None
-) -> Engine:
+def _server_engine(url: URL, lock_timeout_s: float, statement_limit_s: float | None) -> Engine:
     """As `server.make_engine`. Raises UsageError when its driver is not installed."""
     try:
         from flasher.station.records.server import make_engine  # noqa: PLC0415  an extra

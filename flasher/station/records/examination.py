@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from pydantic import ValidationError
 from sqlalchemy import Connection, func, or_, select
@@ -17,7 +16,7 @@ from flasher.i18n import text
 from flasher.protocol.text import printable
 from flasher.station.records import chain, schema
 from flasher.station.records.chain import NAMED, OWN, contents_of
-from flasher.station.records.database import Location
+from flasher.station.records.database import Database
 from flasher.station.records.errors import RecordError
 from flasher.station.records.examined import Examined, ExaminedChain
 from flasher.station.records.files import FileStore
@@ -110,20 +109,12 @@ class _PlaceHeads:
     """Last head of each station."""
 
 
-class Readable(Protocol):
-    """A database as an examination reads it."""
-
-    location: Location
-
-    def reading(self) -> AbstractContextManager[Connection]: ...
-
-
 class Examiner:
     """Examines the records once."""
 
     def __init__(
         self,
-        database: Readable,
+        database: Database,
         files: FileStore,
         key_locations: KeyLocations,
         progress: Progress = lambda _done, _total: None,

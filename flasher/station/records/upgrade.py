@@ -77,6 +77,8 @@ def upgrade(
 
     Raises StationBusyError while a station runs, UsageError, RecordError: nothing was changed.
     """
+    file = location.file
+    assert file is not None  # noqa: S101  records are in a file
     database = Database(location, lock_timeout_s, changes_schema=True)
     with closing(database), ExitStack() as held:
         with suppress(OldSchemaError):
@@ -105,7 +107,7 @@ def upgrade(
         with database.reading() as connection:
             if revision_of(connection) == NEWEST:  # another process was faster
                 return Upgraded(NEWEST, NEWEST, None, ())
-        with _unchanged_on_error(before), _backup(location.file, before) as backup:
+        with _unchanged_on_error(before), _backup(file, before) as backup:
             if station is None:
                 with database.writing() as connection:
                     _change(connection)
@@ -138,11 +140,8 @@ def _unchanged_on_error(before: str) -> Iterator[None]:
 
 
 @contextmanager
-def _backup(file: Path | None, before: str) -> Iterator[Path | None]:
+def _backup(file: Path, before: str) -> Iterator[Path]:
     """Back up an SQLite file; the backup is deleted if the change fails."""
-    if file is None:
-        yield None
-        return
     backup = before_upgrade(file, before)
     while backup.exists():
         backup = backup.with_name(backup.name + "-again")

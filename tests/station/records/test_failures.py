@@ -200,12 +200,9 @@ def test_every_connection_has_the_settings_that_make_a_commit_last(tmp_path: Pat
             }
 
 
-def test_records_in_memory_need_a_folder_for_their_files(tmp_path: Path) -> None:
-    with Store.open(
-        "sqlite://", station="x", folder=tmp_path / "files", clock=FakeClock()
-    ) as store:
-        assert store.recover() == ()
-        assert not store.examine().problems
+def test_records_in_memory_are_refused_since_no_pass_would_be_on_disk(tmp_path: Path) -> None:
+    with pytest.raises(UsageError):
+        Store.open("sqlite://", station="x", folder=tmp_path / "files", clock=FakeClock())
 
 
 def test_a_trace_that_cannot_be_stored_is_an_error_and_leaves_no_part(
