@@ -15,7 +15,7 @@ from typing import Final, Literal
 from playwright.sync_api import Browser, Page, expect
 
 from flasher.i18n import text
-from flasher.station import codes
+from flasher.station.codes import Code
 from flasher.station.events import LineStopped, Progressed, ScanAccepted, ScanRefused, SocketState
 from flasher.station.records.model import StepName
 from flasher.translation import NAMES
@@ -35,10 +35,10 @@ _QUIET_MS: Final = 400
 def _at_work(line: LineScreen) -> None:
     """Four sockets in the middle of a shift."""
     serial = "BAT2620-{:04}".format
-    line.state("1", SocketState.PASS, serial(11), codes.OK.action)
+    line.state("1", SocketState.PASS, serial(11), Code.OK.action)
     line.state("2", SocketState.RUNNING, serial(12))
     line.say(Progressed("2", serial(12), StepName.FLASH, 0.62, 9.0, "bms", at=AT))
-    line.state("3", SocketState.FAIL, serial(13), codes.REFUSED.action)
+    line.state("3", SocketState.FAIL, serial(13), Code.REFUSED.action)
     line.state("4", SocketState.SCAN, "", text("Scan the label of the unit{card}.", card=""))
     line.say(ScanAccepted(serial(12), "label", "2", at=AT))
 

@@ -8,7 +8,7 @@ from typing import Final
 
 from flasher.i18n import text
 from flasher.protocol.text import printable
-from flasher.station import codes
+from flasher.station.codes import Code
 from flasher.station.events import (
     FiguresChanged,
     LabelFailed,
@@ -358,7 +358,7 @@ class Board:
     @property
     def exchanged(self) -> frozenset[str]:
         """Units whose last run ended because they were exchanged."""
-        changed = codes.UNIT_CHANGED.name
+        changed = Code.UNIT_CHANGED.name
         return frozenset(name for name, run in self.ended.items() if run.code == changed)
 
     @property

@@ -17,7 +17,7 @@ from typing import ClassVar, Final
 
 from flasher.i18n import text
 from flasher.protocol.text import printable
-from flasher.station import codes
+from flasher.station.codes import Code
 from flasher.station.events import (
     LineResumed,
     LineStopped,
@@ -95,7 +95,7 @@ _STOPS_LINE: Final = (Refusal.RECIPE_CHANGED.value, Refusal.RECIPE_NOT_TRUSTED.v
 _AGAIN: Final = text("Scan it again.")
 _NOTHING: Final = text("Nothing to do.")
 _CHANGED: Final = Refused(
-    codes.UNIT_CHANGED.name,
+    Code.UNIT_CHANGED.name,
     text("The unit was exchanged, or had no power."),
     text("Check which unit it is, then scan again."),
 )
@@ -300,7 +300,7 @@ class Line:
             why = _CHANGED
             if what.was_missed and not what.is_power_up:
                 reason = text("This computer stalled: the unit may have been exchanged meanwhile.")
-                why = Refused(codes.NOT_OBSERVED.name, reason, _CHANGED.remedy)
+                why = Refused(Code.NOT_OBSERVED.name, reason, _CHANGED.remedy)
             self._silent(socket, now, why, is_certain=False)
         elif socket.occupancy is Occupancy.UNKNOWN and what.is_power_up:
             # The unit may have replaced a silent one after the scan of its card or label.
@@ -354,7 +354,7 @@ class Line:
             self._drop_label(socket, _dropped(reason, remedy))
         elif now - what.unobserved_s < in_reach_at_s <= now:
             reason = text("This computer stalled: the unit may have been exchanged meanwhile.")
-            self._drop_label(socket, Refused(codes.NOT_OBSERVED.name, reason, remedy))
+            self._drop_label(socket, Refused(Code.NOT_OBSERVED.name, reason, remedy))
         elif virtual_label and virtual_label != socket.label:
             reason = text(
                 "The unit in socket {socket} has the label {label}.",
@@ -398,7 +398,7 @@ class Line:
 
     def _claim_failed(self, socket: Socket, what: NotSaved, _now: float) -> None:
         socket.phase, socket.serial = SocketPhase.REST, ""
-        self.stop(codes.RECORD_NOT_SAVED.name, what.reason, what.remedy)
+        self.stop(Code.RECORD_NOT_SAVED.name, what.reason, what.remedy)
 
     def _ended(self, socket: Socket, _what: RunResult, now: float) -> None:
         socket.phase = SocketPhase.SAVE
@@ -417,7 +417,7 @@ class Line:
         """A part of a run was not saved: the run cannot pass, and no other one starts."""
         if socket.phase is SocketPhase.SAVE:
             socket.note = what.reason
-        self.stop(codes.RECORD_NOT_SAVED.name, what.reason, what.remedy)
+        self.stop(Code.RECORD_NOT_SAVED.name, what.reason, what.remedy)
 
     def is_between_units(self, name: str) -> bool:
         """True if no run, scan or question to the plant is about this socket as it is now."""

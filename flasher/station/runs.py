@@ -10,8 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from flasher.station import codes
-from flasher.station.codes import CODES, Code
+from flasher.station.codes import CODES, OF_ANOTHER, Code
 from flasher.station.messages import flash_value, packed, write_key
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.errors import RuleBrokenError
@@ -66,14 +65,14 @@ def save(store: Store, run: ActiveRun, now_s: Callable[[], float]) -> RunResult:
         _attach(store, run)
     if not run.is_save_noted:
         duration_s = max(0.0, now_s() - run.ended_s)
-        state = StepState.ERROR if run.result.code == codes.TRACE_NOT_SAVED.name else StepState.PASS
+        state = StepState.ERROR if run.result.code == Code.TRACE_NOT_SAVED.name else StepState.PASS
         store.step(run.claim.run_id, StepName.SAVE.value, state, duration_s=duration_s)
         run.is_save_noted = True
     try:
         store.finish(run.claim.run_id, _ending(run, run.result))
     except RuleBrokenError as error:
         # The records refuse this PASS: the unit gets no verdict, since the program has a bug.
-        run.result = _worse(run.result, codes.INTERNAL, error.what)
+        run.result = _worse(run.result, Code.INTERNAL, error.what)
         store.finish(run.claim.run_id, _ending(run, run.result))
     store.files.forget_spooled(run.claim.run_id)
     return run.result
@@ -84,7 +83,7 @@ def _judged(run: ActiveRun) -> RunResult:
     if result is None:
         raise ValueError("a run that has not ended cannot be saved")
     if run.journal_error and result.outcome is not RunState.ABORTED:
-        return _worse(result, codes.RECORD_NOT_SAVED, run.journal_error)
+        return _worse(result, Code.RECORD_NOT_SAVED, run.journal_error)
     return result
 
 
@@ -96,18 +95,18 @@ def _attach(store: Store, run: ActiveRun) -> None:
             with suppress(FileNotFoundError):
                 run.attached = [store.files.add(TORN_TRACE, trace)]
         if run.result is not None and run.result.outcome is RunState.PASS:
-            run.result = _worse(run.result, codes.TRACE_NOT_SAVED, "There is no trace of the bus.")
+            run.result = _worse(run.result, Code.TRACE_NOT_SAVED, "There is no trace of the bus.")
         return
     file = store.files.add(TRACE, packed(trace))
     if file.sha256 != closed and run.result is not None:
         words = "The trace on disk differs from the one that was recorded."
-        run.result = _worse(run.result, codes.TRACE_NOT_SAVED, words)
+        run.result = _worse(run.result, Code.TRACE_NOT_SAVED, words)
     run.attached = [file]
 
 
 def _ending(run: ActiveRun, result: RunResult) -> RunResult:
     """The result as it is saved."""
-    code = CODES.get(result.code, codes.INTERNAL)
+    code = CODES.get(result.code, Code.INTERNAL)
     log = next((file.sha256 for file in run.attached if file.kind == TRACE), None)
     text = " ".join(filter(None, (sentence(result.text), code.action)))
     if result.outcome is RunState.PASS:
@@ -154,7 +153,7 @@ def with_history(
     runs = [run for life in lives if life.part == recipe.recipe.part for run in life.runs]
     still_open = _after(runs, lambda run: run.run.state not in _OPEN)
     unfinished = _after(runs, lambda run: run.run.state is RunState.PASS)
-    of_this_unit = _after(still_open, lambda run: run.run.code in codes.OF_ANOTHER)
+    of_this_unit = _after(still_open, lambda run: run.run.code in OF_ANOTHER)
     passed = next((run for run in reversed(runs) if run.run.state is RunState.PASS), None)
     written = passed.writes if passed is not None else ()
     return replace(

@@ -34,7 +34,7 @@ from typing import Final
 
 from flasher.i18n import text
 from flasher.protocol.text import printable
-from flasher.station import codes
+from flasher.station.codes import Code
 from flasher.station.pattern import TEXT_MAX
 from flasher.station.records.errors import Refusal
 from flasher.station.records.model import RunState
@@ -287,11 +287,11 @@ def check_fits(sockets: Sockets, socket: Socket, serial: str) -> None:
     if last is not None and last.serial != serial:
         raise still_there(socket, last)
     if socket.is_of_another(serial):
-        raise Refused(codes.WRONG_UNIT.name, _report_of(socket), codes.WRONG_UNIT.action)
+        raise Refused(Code.WRONG_UNIT.name, _report_of(socket), Code.WRONG_UNIT.action)
     for each in sockets.values():
         if each is not socket and each.is_there and each.own == serial:
             raise Refused(
-                codes.WRONG_UNIT.name,
+                Code.WRONG_UNIT.name,
                 _report_of(each),
                 text(
                     "Compare the labels of the units in the sockets {one} and {other}.",

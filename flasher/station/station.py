@@ -25,9 +25,9 @@ from flasher.errors import UsageError
 from flasher.i18n import text
 from flasher.log import log_event
 from flasher.protocol.text import printable
-from flasher.station import codes, line, pins
+from flasher.station import line, pins
 from flasher.station.adapters import with_recipe
-from flasher.station.codes import CODES
+from flasher.station.codes import Code
 from flasher.station.events import (
     FiguresChanged,
     LabelFailed,
@@ -489,7 +489,7 @@ class Station:
             self.store.note(what, data)
         except RecordError as error:
             self._not_saved("", "", None, error)
-            self.line.stop(codes.RECORD_NOT_SAVED.name, error.what, error.remedy)
+            self.line.stop(Code.RECORD_NOT_SAVED.name, error.what, error.remedy)
 
     # -- recipes from the plant -------------------------------------------------------------------
 
@@ -578,7 +578,7 @@ class Station:
         try:
             self.store.note(AuditEvent.RECIPE_APPROVED, {**data, **facts, **published})
         except RecordError as error:
-            return Refused(codes.RECORD_NOT_SAVED.name, _error_line(error), error.remedy)
+            return Refused(Code.RECORD_NOT_SAVED.name, _error_line(error), error.remedy)
         self._approved |= dict.fromkeys(sockets, offer)
         self._show_offers()
         return None
@@ -596,7 +596,7 @@ class Station:
                 setup = self._with_number(with_recipe(self._setups[name], recipe), recipe)
             except RecordError as error:
                 self._not_saved("", "", None, error)
-                self.line.stop(codes.RECORD_NOT_SAVED.name, error.what, error.remedy)
+                self.line.stop(Code.RECORD_NOT_SAVED.name, error.what, error.remedy)
                 return
             del self._approved[name]
             # The process that knows the old recipe gets no further run.
@@ -714,7 +714,7 @@ class Station:
             words = text("The plant: {answer}.", answer=printable(answer.text))
             self.emit(OperatorPrompted("", words))
         if not self.supervisor.send(socket, self._runs[socket].claim):
-            self._end_lost(socket, codes.PROCESS_DIED.meaning, hung=False)
+            self._end_lost(socket, Code.PROCESS_DIED.meaning, hung=False)
 
     def _active_run(self, socket: str) -> ActiveRun | None:
         """Run of a socket whose process has not reported the end."""
@@ -778,7 +778,7 @@ class Station:
         run = self._active_run(socket)
         if run is None:
             return
-        code = codes.PROCESS_HUNG if hung else codes.PROCESS_DIED
+        code = Code.PROCESS_HUNG if hung else Code.PROCESS_DIED
         text, duration_s = f"In {run.where}: {reason}.", self._now - run.begun_s
         self._end(socket, RunResult(code.outcome, code.name, text, duration_s))
 
@@ -795,13 +795,13 @@ class Station:
             return False
         del self._runs[socket]
         self._gate.ended(run.admission)
-        code = CODES[result.code]
+        code = Code[result.code]
         is_pass = result.outcome is RunState.PASS
         action = _RECHECK if is_pass and claim.unchecked else code.action
         ended = RunEnded(saved.run, action, saved.targets)
         self.emit(ended)
         self.line.feed(socket, ended, self._now)
-        if code is codes.TRACE_NOT_SAVED:  # the next ones would not be judged either
+        if code is Code.TRACE_NOT_SAVED:  # the next ones would not be judged either
             self.line.stop(code.name, result.text, code.action)
         with suppress(RecordError):
             self.emit(FiguresChanged(self.figures))
@@ -834,7 +834,7 @@ class Station:
             groups = groups_by(self.store.read.recipe(last.run.recipe_sha256), serial)
             self.store.note(AuditEvent.REPRINT, data)
         except RecordError as error:
-            return Refused(codes.RECORD_NOT_SAVED.name, _error_line(error), error.remedy)
+            return Refused(Code.RECORD_NOT_SAVED.name, _error_line(error), error.remedy)
         self._labels.submit(LabelJob("", serial, values_of(last.run, groups), is_reprint=True))
         return None
 

@@ -10,7 +10,6 @@ from flasher.errors import NoAnswerError
 from flasher.host.identity import IdentityCheck
 from flasher.host.items import Readable
 from flasher.host.write import WritePlan, field_changes
-from flasher.station import codes
 from flasher.station.codes import Code
 from flasher.station.messages import write_key
 from flasher.station.recipe import Limit, Scan, fill
@@ -30,12 +29,12 @@ NOT_IDENTIFIED: Final = "not identified before flashing"
 BEFORE: Final = "before "
 """Prefix of measurements of values that must not change, read before the first write."""
 OF_CHECK: Final = {
-    IdentityCheck.HARDWARE: codes.WRONG_HARDWARE,
-    IdentityCheck.DOWNGRADE: codes.OLD_VERSION,
-    IdentityCheck.PREVIOUS: codes.OLD_VERSION,
-    IdentityCheck.IN_USE: codes.IN_USE,
-    IdentityCheck.CHARGE: codes.LOW_CHARGE,
-    IdentityCheck.UNSIGNED: codes.OLD_RELEASE,
+    IdentityCheck.HARDWARE: Code.WRONG_HARDWARE,
+    IdentityCheck.DOWNGRADE: Code.OLD_VERSION,
+    IdentityCheck.PREVIOUS: Code.OLD_VERSION,
+    IdentityCheck.IN_USE: Code.IN_USE,
+    IdentityCheck.CHARGE: Code.LOW_CHARGE,
+    IdentityCheck.UNSIGNED: Code.OLD_RELEASE,
 }
 """Codes of failed checks; NOT_FOR_DEVICE for all others."""
 
@@ -60,7 +59,7 @@ def check_measured(measured: Sequence[Measurement]) -> None:
             low = "" if each.low is None else f"from {each.low:g} "
             high = "" if each.high is None else f"to {each.high:g}"
             shown = f"{each.value:g} {each.unit}; allowed is {low}{high}".strip()
-        raise StepFailedError(codes.LIMIT, f"{each.name} is {shown}.")
+        raise StepFailedError(Code.LIMIT, f"{each.name} is {shown}.")
 
 
 def wanted_text(plan: WritePlan) -> str:
@@ -132,7 +131,7 @@ class UnitReads:
         if limit.expected is not None:
             return Measurement(name, text=shown, expected=fill(limit.expected, self._scan))
         if not isinstance(value, int | float):
-            raise StepFailedError(codes.RECIPE, f"{name} is not a number.")
+            raise StepFailedError(Code.RECIPE, f"{name} is not a number.")
         return Measurement(name, float(value), codec.unit, low=limit.low, high=limit.high)
 
     # -- values that must not change --------------------------------------------------------------
@@ -150,7 +149,7 @@ class UnitReads:
                 now = {name: text for name, text in known.items() if name.startswith(start)}
                 if not now:
                     raise StepFailedError(
-                        codes.UNCHANGED_UNKNOWN,
+                        Code.UNCHANGED_UNKNOWN,
                         f"{target} {readable.name} cannot be read: it runs no application.",
                     )
             for name, text in now.items():
@@ -169,7 +168,7 @@ class UnitReads:
     def _check_unchanged(self, name: str, text: str) -> None:
         first = self._before.get(name)
         if text != first:
-            raise StepFailedError(codes.CHANGED, f"{name} was {first!a}, and is {text!a} now.")
+            raise StepFailedError(Code.CHANGED, f"{name} was {first!a}, and is {text!a} now.")
 
     def _unchanged(self) -> Iterator[tuple[str, Readable]]:
         for part in self._recipe.recipe.unchanged:
@@ -188,7 +187,7 @@ class UnitReads:
             try:
                 fields = self._targets[plan.target.name].read(plan.writable.read_back)
             except NoAnswerError as error:
-                raise StepFailedError(codes.NOT_RUNNING, error.what) from error
+                raise StepFailedError(Code.NOT_RUNNING, error.what) from error
             wanted = [name for name, _ in type(plan.content).LAYOUT if name in fields]
             value = ", ".join(fields[name][1] for name in wanted)
             expected = wanted_text(plan)
@@ -198,5 +197,5 @@ class UnitReads:
             measured.append(Measurement(key, text=value, expected=expected))
             if value != expected:
                 raise StepFailedError(
-                    codes.WRITE_DIFFERS, f"{key} reads {value!a} instead of {expected!a}."
+                    Code.WRITE_DIFFERS, f"{key} reads {value!a} instead of {expected!a}."
                 )

@@ -22,7 +22,7 @@ from flasher.errors import (
     WrongDeviceError,
 )
 from flasher.protocol.engine import Tap
-from flasher.station import codes
+from flasher.station.codes import OF_SILENCE, Code
 from flasher.station.continuity import Continuity
 from flasher.station.events import OperatorPrompted, Progressed, StepEnded, StepStarted
 from flasher.station.messages import Journal, JournalError, RunEvent
@@ -49,11 +49,11 @@ _STATES: Final = {
     RunState.ABORTED: StepState.ERROR,
 }
 _BY_ERROR: Final = (
-    (BusError, codes.BUS),
-    (NoAnswerError, codes.NO_ANSWER),
-    (WrongDeviceError, codes.NOT_FOR_DEVICE),
-    (VerificationError, codes.WRITE_DIFFERS),
-    (FlasherError, codes.RECIPE),
+    (BusError, Code.BUS),
+    (NoAnswerError, Code.NO_ANSWER),
+    (WrongDeviceError, Code.NOT_FOR_DEVICE),
+    (VerificationError, Code.WRITE_DIFFERS),
+    (FlasherError, Code.RECIPE),
 )
 
 
@@ -137,7 +137,7 @@ class UnitRun:
     def run(self) -> RunResult:
         """Run all steps and return the result. Any exception is a bug."""
         began_at = self._clock.now()
-        code, text, verified = codes.OK, "", {}
+        code, text, verified = Code.OK, "", {}
         try:
             steps = self._steps()
             for step, target, act in steps.acts():
@@ -146,7 +146,7 @@ class UnitRun:
         except StepFailedError as failed:
             code, text = failed.code, failed.text
         except JournalError as error:
-            code, text = codes.RECORD_NOT_SAVED, error.what
+            code, text = Code.RECORD_NOT_SAVED, error.what
         duration_s = self._clock.now() - began_at
         return RunResult(code.outcome, code.name, text, duration_s, verified)
 
@@ -179,7 +179,7 @@ class UnitRun:
                 prompt,
             )
         except FlasherError as error:
-            raise StepFailedError(codes.RECIPE, error.what) from error
+            raise StepFailedError(Code.RECIPE, error.what) from error
 
     # -- one step ---------------------------------------------------------------------------------
 
@@ -223,9 +223,9 @@ class UnitRun:
         except StepFailedError as error:
             failed = error
         except InterruptedByUserError:
-            code, text = codes.TOO_SLOW, "It was not done in time."
+            code, text = Code.TOO_SLOW, "It was not done in time."
             if self._cancelled():
-                code, text = codes.OPERATOR_ABORT, f"Stopped in {step.value}."
+                code, text = Code.OPERATOR_ABORT, f"Stopped in {step.value}."
             failed = StepFailedError(code, f"{text} {steps.device_state}".strip())
         except JournalError:
             raise
@@ -235,7 +235,7 @@ class UnitRun:
             failed = StepFailedError(code, words)
         finally:
             self._step_ends_at = None
-        if failed is not None and failed.code in codes.OF_SILENCE:
+        if failed is not None and failed.code in OF_SILENCE:
             failed = self._of_silence(steps, failed)
         failed = self._changed(steps) or failed
         duration_s = self._clock.now() - began_at
@@ -243,7 +243,7 @@ class UnitRun:
             measured.append(Measurement("duration", duration_s, "s", high=limit_s))
             if failed is None and duration_s > limit_s:
                 failed = StepFailedError(
-                    codes.TOO_SLOW, f"{step.value}: {duration_s:.1f} s, {limit_s:g} s are allowed."
+                    Code.TOO_SLOW, f"{step.value}: {duration_s:.1f} s, {limit_s:g} s are allowed."
                 )
         state, code_name = StepState.PASS, ""
         if failed is not None:
@@ -261,7 +261,7 @@ class UnitRun:
         unobserved = next((e.unobserved for e in self._continuity.values() if e.unobserved), "")
         if not (lost or unobserved):
             return None
-        code = codes.UNIT_CHANGED if lost else codes.NOT_OBSERVED
+        code = Code.UNIT_CHANGED if lost else Code.NOT_OBSERVED
         return StepFailedError(code, f"{lost or unobserved} {steps.device_state}".strip())
 
     def _of_silence(self, steps: UnitSteps, failed: StepFailedError) -> StepFailedError:
@@ -274,13 +274,13 @@ class UnitRun:
         except StepFailedError as silent:
             return silent
         except BusError as error:
-            return StepFailedError(codes.BUS, error.what)
+            return StepFailedError(Code.BUS, error.what)
         except InterruptedByUserError:
             pass  # the next step raises it again
         return failed
 
     def _before_next_try(self, steps: UnitSteps, failed: StepFailedError, rule: StepRule) -> None:
-        if failed.code is codes.BUS:
+        if failed.code is Code.BUS:
             # The adapter may be back; if not, the next try fails.
             with suppress(BusError):
                 self._connection.link.reopen()
@@ -291,7 +291,7 @@ class UnitRun:
         except InterruptedByUserError:
             return
         except BusError as error:
-            raise StepFailedError(codes.BUS, error.what) from error
+            raise StepFailedError(Code.BUS, error.what) from error
 
     def _is_over(self) -> bool:
         """True if a person aborted the run, the step's time is over, or the unit may have been

@@ -22,7 +22,7 @@ from flasher.host.verify import Verdict, memory_check
 from flasher.host.write import WritePlan
 from flasher.i18n import text
 from flasher.protocol.fields import Content
-from flasher.station import codes
+from flasher.station.codes import NEED_POWER_CYCLE, OF_ENDING, Code
 from flasher.station.messages import Journal, flash_value, write_key
 from flasher.station.power import PowerControl
 from flasher.station.presence import PROBE_S
@@ -55,13 +55,13 @@ from flasher.station.unit_target import Identified, StepFailedError, UnitTarget
 from flasher.wording import wording
 
 _OF_VERDICT: Final = {
-    Verdict.VERSION_OTHER: codes.OTHER_VERSION,
-    Verdict.NO_ANSWER: codes.NOT_RUNNING,
-    Verdict.IN_BOOTLOADER: codes.IN_BOOTLOADER,
-    Verdict.MEMORY_OTHER: codes.MEMORY_DIFFERS,
-    Verdict.OTHER_UNIT: codes.UNIT_CHANGED,
-    Verdict.SECOND_TOOL: codes.SECOND_TOOL,
-    Verdict.INTERRUPTED: codes.OPERATOR_ABORT,
+    Verdict.VERSION_OTHER: Code.OTHER_VERSION,
+    Verdict.NO_ANSWER: Code.NOT_RUNNING,
+    Verdict.IN_BOOTLOADER: Code.IN_BOOTLOADER,
+    Verdict.MEMORY_OTHER: Code.MEMORY_DIFFERS,
+    Verdict.OTHER_UNIT: Code.UNIT_CHANGED,
+    Verdict.SECOND_TOOL: Code.SECOND_TOOL,
+    Verdict.INTERRUPTED: Code.OPERATOR_ABORT,
 }
 """Codes of failed verifications."""
 _SPACINGS_OF_WATCH: Final = 3
@@ -159,21 +159,21 @@ class UnitSteps:
             self._identified[target.name] = identified
             if identified.two_devices:
                 raise StepFailedError(
-                    codes.TWO_DEVICES,
+                    Code.TWO_DEVICES,
                     f"Two devices answer as {target.name}: {identified.two_devices}.",
                 )
             is_known = target.continuity.has_answered and not target.may_restart
             if is_known and identified.seen.version is None:
-                raise StepFailedError(codes.UNIT_CHANGED, f"The {target.name} stopped answering.")
+                raise StepFailedError(Code.UNIT_CHANGED, f"The {target.name} stopped answering.")
             may_await_power = self._power is not None or target.may_restart
             is_rescue = self._claim.kind is RunKind.RECHECK and may_await_power
             if target.is_silent(identified) and not is_rescue:
                 raise StepFailedError(
-                    codes.NO_ANSWER, f"The {target.name} neither answers nor announces itself."
+                    Code.NO_ANSWER, f"The {target.name} neither answers nor announces itself."
                 )
             must_answer = target.version_request is not None and not self._claim.has_card
             if must_answer and identified.seen.version is None:
-                raise StepFailedError(codes.NO_CARD, f"The {target.name} does not answer.")
+                raise StepFailedError(Code.NO_CARD, f"The {target.name} does not answer.")
             target.continuity.begin(identified.seen.version)
             target.check_cancelled()
             measured += identity_measurements(target, identified)
@@ -199,7 +199,7 @@ class UnitSteps:
                 if any(plan.writable.name == SERIAL_NUMBER for plan in self._plans):
                     continue  # it gets its number in this run
             raise StepFailedError(
-                codes.WRONG_UNIT,
+                Code.WRONG_UNIT,
                 f"The unit reports {own!a:.40}, the label has {self._claim.serial!a:.40}.",
             )
 
@@ -208,7 +208,7 @@ class UnitSteps:
         for target in self.targets:
             findings += self._judge(target, measured)
         if self._is_verify_only and any(each.version_request is None for each in self.targets):
-            raise StepFailedError(codes.CANNOT_VERIFY, "A target has no query for its version.")
+            raise StepFailedError(Code.CANNOT_VERIFY, "A target has no query for its version.")
         in_application = {
             name for name, each in self._identified.items() if each.seen.version is not None
         }
@@ -237,14 +237,14 @@ class UnitSteps:
             name = f"{target.name} {finding.check.value}"
             measured.append(Measurement(name, text=finding.verdict.value))
             if finding.ending is not None and not self._is_verify_only:
-                code = OF_CHECK.get(finding.check, codes.NOT_FOR_DEVICE)
+                code = OF_CHECK.get(finding.check, Code.NOT_FOR_DEVICE)
                 raise StepFailedError(code, finding.text)
         firmware = loaded.firmware
-        check_texts(firmware.hardware_versions, seen.hardware_version, codes.WRONG_HARDWARE)
+        check_texts(firmware.hardware_versions, seen.hardware_version, Code.WRONG_HARDWARE)
         # A unit that failed after its flash already runs the new version.
         is_new = seen.firmware_version == loaded.version
         if self._claim.kind is RunKind.PRODUCTION and not is_new:
-            check_texts(firmware.previous_versions, seen.firmware_version, codes.OLD_VERSION)
+            check_texts(firmware.previous_versions, seen.firmware_version, Code.OLD_VERSION)
         return findings
 
     # -- flashing ---------------------------------------------------------------------------------
@@ -271,7 +271,7 @@ class UnitSteps:
             result = self._upgrade(target, at_power_up=target.is_silent(identified))
         except StepFailedError as failed:
             may_rescue = self._power is not None or failed.needs_rescue
-            if failed.code not in codes.NEED_POWER_CYCLE:
+            if failed.code not in NEED_POWER_CYCLE:
                 raise
             if self.has_lost_its_session:
                 with suppress(BusError, InterruptedByUserError):
@@ -349,7 +349,7 @@ class UnitSteps:
         error = result.error()
         words = "" if error is None else error.what
         raise StepFailedError(
-            code or codes.OF_ENDING.get(result.outcome.ending, codes.TRANSFER_FAILED),
+            code or OF_ENDING.get(result.outcome.ending, Code.TRANSFER_FAILED),
             f"{words} {self.device_state}".strip(),
             needs_rescue=left in (DeviceLeft.NO_APPLICATION, DeviceLeft.PERHAPS_ERASED),
         )
@@ -367,12 +367,12 @@ class UnitSteps:
         """The error for a device that confirmed no image after the adapter was lost."""
         if result.outcome.is_completed:
             return StepFailedError(
-                codes.NOT_OBSERVED,
+                Code.NOT_OBSERVED,
                 f"The adapter was away before the {target.name} started its new application:"
                 " another unit could have been connected.",
             )
         return StepFailedError(
-            codes.UNIT_CHANGED,
+            Code.UNIT_CHANGED,
             f"The adapter was away, and the {target.name} did not continue its transfer.",
         )
 
@@ -397,13 +397,11 @@ class UnitSteps:
         was_running = target.continuity.is_running and not target.may_restart
         answer = target.await_application()
         if answer is None and was_running:
-            raise StepFailedError(codes.UNIT_CHANGED, f"The {target.name} stopped answering.")
+            raise StepFailedError(Code.UNIT_CHANGED, f"The {target.name} stopped answering.")
         if answer is None and target.continuity.is_announcing:
-            raise StepFailedError(
-                codes.IN_BOOTLOADER, f"The {target.name} stays in its bootloader."
-            )
+            raise StepFailedError(Code.IN_BOOTLOADER, f"The {target.name} stays in its bootloader.")
         if answer is None:
-            raise StepFailedError(codes.NOT_RUNNING, f"The {target.name} does not answer.")
+            raise StepFailedError(Code.NOT_RUNNING, f"The {target.name} does not answer.")
         own = self._identified[target.name]
         self._identified[target.name] = replace(own, seen=replace(own.seen, version=answer))
         return answer
@@ -417,7 +415,7 @@ class UnitSteps:
         written = target.device.write_planned(plan, old)
         error = written.error()
         if isinstance(error, VerificationError):
-            code = codes.WRITE_DIFFERS if written.differences else codes.WRITE_FAILED
+            code = Code.WRITE_DIFFERS if written.differences else Code.WRITE_FAILED
             raise StepFailedError(code, error.what)
         target.continuity.wrote(plan.content)
         read = [change.read_back for change in written.changes if change.read_back is not None]
@@ -438,10 +436,10 @@ class UnitSteps:
             try:
                 if not target.restart(self._power):
                     raise StepFailedError(
-                        codes.NO_RESTART, f"The {target.name} did not announce its bootloader."
+                        Code.NO_RESTART, f"The {target.name} did not announce its bootloader."
                     )
             except NoAnswerError as error:
-                raise StepFailedError(codes.NO_RESTART, error.what) from error
+                raise StepFailedError(Code.NO_RESTART, error.what) from error
         for target in restarting:
             self._await(target)
         return BY_POWER if self._power is not None else "by reset"
@@ -452,7 +450,7 @@ class UnitSteps:
             level = self._verify_image(target, measured)
             self.verified[target.name] = level
             if level < target.loaded.required:
-                raise StepFailedError(codes.CANNOT_VERIFY, f"{target.name}: {level.words}.")
+                raise StepFailedError(Code.CANNOT_VERIFY, f"{target.name}: {level.words}.")
             levels.append(f"{target.name}: {level.words}")
         self._check_label()
         self._reads.written(self._plans, measured)
@@ -483,15 +481,15 @@ class UnitSteps:
         running = firmware_version(self._await(target))
         # A device that was in its bootloader could not report its hardware before.
         hardware = self._identified[name].seen.hardware_version
-        check_texts(loaded.release.hardware_versions, hardware, codes.WRONG_HARDWARE)
-        check_texts(loaded.firmware.hardware_versions, hardware, codes.WRONG_HARDWARE)
+        check_texts(loaded.release.hardware_versions, hardware, Code.WRONG_HARDWARE)
+        check_texts(loaded.firmware.hardware_versions, hardware, Code.WRONG_HARDWARE)
         if not loaded.version and not needs_memory:
             return self._completed(target)  # there is no version to compare the answer with
         version = Measurement(f"{name} version", text=running, expected=loaded.version or None)
         measured.append(version)
         if not version.is_within:
             raise StepFailedError(
-                codes.OTHER_VERSION, f"{name} runs {running} instead of {loaded.version}."
+                Code.OTHER_VERSION, f"{name} runs {running} instead of {loaded.version}."
             )
         if not needs_memory:
             return Verified.VERSION
@@ -504,7 +502,7 @@ class UnitSteps:
         target.run(check, on_event)
         result = check.result
         if not result.ok:
-            code = _OF_VERDICT.get(result.verdict, codes.MEMORY_DIFFERS)
+            code = _OF_VERDICT.get(result.verdict, Code.MEMORY_DIFFERS)
             raise StepFailedError(
                 code, f"{name}: {wording(result.verdict)} {result.detail}".strip()
             )
@@ -515,7 +513,7 @@ class UnitSteps:
         in this run. Raises StepFailedError.
         """
         if target.name not in self._flashed:
-            raise StepFailedError(codes.CANNOT_VERIFY, f"The {target.name} has no version query.")
+            raise StepFailedError(Code.CANNOT_VERIFY, f"The {target.name} has no version query.")
         if not self._recipe.recipe.allow_completed_not_read_back:
-            raise StepFailedError(codes.CANNOT_VERIFY, "The recipe requires it to be read back.")
+            raise StepFailedError(Code.CANNOT_VERIFY, "The recipe requires it to be read back.")
         return Verified.COMPLETED

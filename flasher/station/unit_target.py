@@ -20,7 +20,6 @@ from flasher.protocol.contents import Reset
 from flasher.protocol.engine import Engine, Tap
 from flasher.protocol.fields import Content
 from flasher.protocol.spec import Command
-from flasher.station import codes
 from flasher.station.codes import Code
 from flasher.station.continuity import Continuity
 from flasher.station.power import PowerControl
@@ -183,7 +182,7 @@ class UnitTarget:
         if not self.continuity.is_running or self.await_application() is not None:
             return
         if not self.may_restart:
-            raise StepFailedError(codes.UNIT_CHANGED, f"The {self.name} stopped answering.")
+            raise StepFailedError(Code.UNIT_CHANGED, f"The {self.name} stopped answering.")
 
     def process_queued_frames(self) -> None:
         """Process the frames that are queued in the driver."""

@@ -31,7 +31,7 @@ from flasher.files import make_private
 from flasher.i18n import text
 from flasher.log import log_event
 from flasher.protocol.text import printable
-from flasher.station import codes
+from flasher.station.codes import Code
 from flasher.station.events import StepEnded
 from flasher.station.messages import (
     AdapterDown,
@@ -340,17 +340,17 @@ class Worker:
         except StationGoneError:
             return
         except FlasherError as error:
-            result = _error_result(codes.TRACE_NOT_SAVED, error.what)
+            result = _error_result(Code.TRACE_NOT_SAVED, error.what)
         except Exception as error:  # noqa: BLE001  a bug must not end the socket's process
             log_event(error)
-            result = _error_result(codes.INTERNAL, f"{type(error).__name__}: {error}")
+            result = _error_result(Code.INTERNAL, f"{type(error).__name__}: {error}")
         if recorder is not None and recorder.failure is None:
             with suppress(OSError):
                 result = replace(result, trace_sha256=pack(claim.trace))
         if result.trace_sha256 is None and result.outcome is RunState.PASS:
             why = "" if recorder is None or recorder.failure is None else f": {recorder.failure}"
             words = f"The trace of the bus is not complete{why}."
-            result = _error_result(codes.TRACE_NOT_SAVED, words)
+            result = _error_result(Code.TRACE_NOT_SAVED, words)
         self._pipe.send(result)
         if self._virtual is not None:
             self._virtual.run_ended()
@@ -373,7 +373,7 @@ def pack(path: Path) -> str:
     return hashlib.sha256(made.read_bytes()).hexdigest()
 
 
-def _error_result(code: codes.Code, what: str) -> RunResult:
+def _error_result(code: Code, what: str) -> RunResult:
     return RunResult(code.outcome, code.name, printable(what), 0.0)
 
 

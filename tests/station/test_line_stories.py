@@ -19,7 +19,8 @@ import pytest
 
 from flasher.mock.table import BootloaderState
 from flasher.simulate.planting import swapped
-from flasher.station import codes
+from flasher.station import runs
+from flasher.station.codes import Code
 from flasher.station.continuity import Continuity
 from flasher.station.presence import Presence, TargetWatcher
 from flasher.station.records.model import StepName
@@ -740,14 +741,12 @@ def report_nobody_after_a_run(patch: pytest.MonkeyPatch) -> None:
 
 
 def accuse_everybody(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(
-        UnitRun, "_changed", lambda *_: StepFailedError(codes.UNIT_CHANGED, "It differs.")
-    )
+    patch.setattr(UnitRun, "_changed", lambda *_: StepFailedError(Code.UNIT_CHANGED, "It differs."))
 
 
 def write_and_fail(patch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
-        raise StepFailedError(codes.NOT_RUNNING, "It does not answer.")
+        raise StepFailedError(Code.NOT_RUNNING, "It does not answer.")
 
     patch.setattr(UnitSteps, "_verify", fail)
 
@@ -757,7 +756,7 @@ def never_begin(patch: pytest.MonkeyPatch) -> None:
 
 
 def trust_every_run(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(codes, "OF_ANOTHER", frozenset())
+    patch.setattr(runs, "OF_ANOTHER", frozenset())
 
 
 def count_whole_announcements(patch: pytest.MonkeyPatch) -> None:

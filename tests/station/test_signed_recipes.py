@@ -14,7 +14,7 @@ from flasher.release.store import TrustStore
 from flasher.settings.manifest import release_of, to_toml
 from flasher.station.certificate import proven, render_certificate
 from flasher.station.certificate_check import check_certificate
-from flasher.station.codes import NOT_TRUSTED, OLD_RELEASE
+from flasher.station.codes import Code
 from flasher.station.recipe_file import load_checked, load_recipe
 from flasher.station.records.errors import ClaimRefusedError, Refusal
 from flasher.station.records.model import (
@@ -284,7 +284,7 @@ def test_an_older_release_than_the_records_have_for_the_unit_is_not_flashed(
     bench.put(
         MockDevice(BMS, bitrate_bps=250_000, profile=NEW_UNIT, has_application=has_application)
     )
-    assert run(bench, Signature("signed by anna", "48V", 6), 7) == (OLD_RELEASE.name, False)
+    assert run(bench, Signature("signed by anna", "48V", 6), 7) == (Code.OLD_RELEASE.name, False)
     assert checks(bench)["bms signature"].text == "signed by anna"
 
 
@@ -313,7 +313,7 @@ def test_a_trust_file_that_comes_during_a_run_refuses_an_unsigned_image(
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     TrustStore().install(chain_of(first_trust()))
-    assert bench.run().code == NOT_TRUSTED.name
+    assert bench.run().code == Code.NOT_TRUSTED.name
     assert bench.device.stored_image != IMAGES[BMS].data
 
 

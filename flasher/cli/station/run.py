@@ -39,8 +39,8 @@ from flasher.errors import (
     UsageError,
 )
 from flasher.protocol.text import printable
-from flasher.station import codes
 from flasher.station.adapters import Resolved, detect, resolve, with_recipe, worker_setups
+from flasher.station.codes import Code
 from flasher.station.config import MockUnits, StationConfig, load_config, mock_config
 from flasher.station.events import StationEvent
 from flasher.station.operators import Crew
@@ -450,7 +450,7 @@ class _Session:
         self.output.results(self._summary())
         error, stopped = self._failure, board.stopped
         if error is None and stopped is not None:
-            is_record = stopped.code == codes.RECORD_NOT_SAVED.name
+            is_record = stopped.code == Code.RECORD_NOT_SAVED.name
             kind = RecordError if is_record else UsageError
             error = kind(f"The line was stopped: {stopped.reason}", remedy=stopped.remedy)
         # Only a list of scans can be incomplete: a shift ends whenever a person ends it.
