@@ -14,7 +14,7 @@ import re
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -59,7 +59,21 @@ class Checkpoint:
     previous: str
     """SHA-256 of the previous checkpoint, so that no segment can be left out."""
     key: str
-    signature: str
+    signature: str = ""
+
+    @property
+    def signed_text(self) -> str:
+        return json.dumps(self._body, sort_keys=True)
+
+    @property
+    def line(self) -> str:
+        return json.dumps({"checkpoint": self._body, "signature": self.signature}, sort_keys=True)
+
+    @property
+    def _body(self) -> dict[str, Any]:
+        found = asdict(self)
+        del found["signature"]
+        return found
 
 
 @dataclass(frozen=True)
@@ -136,11 +150,11 @@ class HeadsFile:
             if is_closed and after:
                 end = self._last_entry(number)
                 if isinstance(end, Checkpoint) and end.head.number <= after:
-                    previous = _hash_of(_checkpoint_line(end))
+                    previous = _hash_of(end.line)
                     continue
             for entry in self._checked(number, previous, is_closed=is_closed):
                 if isinstance(entry, Checkpoint):
-                    previous = _hash_of(_checkpoint_line(entry))
+                    previous = _hash_of(entry.line)
                 yield entry
 
     def of_row(self, number: int) -> tuple[ChainHead, ...]:
@@ -190,7 +204,7 @@ class HeadsFile:
         """Close a segment if needed; returns its checkpoint line, None without a head."""
         end = self._last_entry(number)
         if isinstance(end, Checkpoint):
-            return _checkpoint_line(end)
+            return end.line
         if end is None:
             return None
         path = self._segment(number)
@@ -205,9 +219,8 @@ class HeadsFile:
         if number > 1:
             lines = self._lines(Position(number), is_one=True)
             before = _hash_of(next((line for _, line in lines), b"").decode("ascii", "replace"))
-        body = _body(number, end, digest.hexdigest(), before, key.public)
-        signature = key.sign(json.dumps(body, sort_keys=True), SEGMENT)
-        line = json.dumps({"checkpoint": body, "signature": signature}, sort_keys=True)
+        made = Checkpoint(number, end, digest.hexdigest(), before, key.public)
+        line = replace(made, signature=key.sign(made.signed_text, SEGMENT)).line
         _write(path, [line])
         return line
 
@@ -257,7 +270,8 @@ class HeadsFile:
             else:
                 stated = (entry.segment, entry.head, entry.sha256, entry.previous)
                 found = (number, last, digest.hexdigest(), previous)
-                if stated != found or not _is_whole(entry):
+                is_whole = is_signed(entry.signed_text, entry.signature, entry.key, SEGMENT)
+                if stated != found or not is_whole:
                     yield HeadsFault(where, "it was changed after it was closed")
                 yield entry
             digest.update(line + b"\n")
@@ -329,26 +343,5 @@ def _head(found: Any) -> ChainHead:
     return head
 
 
-def _body(number: int, head: ChainHead, sha256: str, previous: str, public: str) -> dict[str, Any]:
-    found = asdict(Checkpoint(number, head, sha256, previous, public, ""))
-    del found["signature"]
-    return found
-
-
-def _body_of(checkpoint: Checkpoint) -> dict[str, Any]:
-    each = checkpoint
-    return _body(each.segment, each.head, each.sha256, each.previous, each.key)
-
-
-def _checkpoint_line(checkpoint: Checkpoint) -> str:
-    found = {"checkpoint": _body_of(checkpoint), "signature": checkpoint.signature}
-    return json.dumps(found, sort_keys=True)
-
-
 def _hash_of(line: str) -> str:
     return hashlib.sha256(line.encode("ascii", "replace")).hexdigest()
-
-
-def _is_whole(checkpoint: Checkpoint) -> bool:
-    text = json.dumps(_body_of(checkpoint), sort_keys=True)
-    return is_signed(text, checkpoint.signature, checkpoint.key, SEGMENT)
