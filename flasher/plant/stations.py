@@ -9,8 +9,6 @@ from typing import Final
 
 from sqlalchemy import Connection, text
 
-from flasher.plant.central import Central
-
 _QUERY: Final = text("""
 SELECT p.name AS station, p.role, p.reported_at, p.version, p.unsent, p.oldest_unsent_at,
     p.clock_offset_s, p.disk_free_bytes, p.refusal, p.other_refusal, p.other_reported_at,
@@ -94,12 +92,6 @@ class StationStatus:
     """When that PC reported last."""
     recipes: tuple[SocketRecipe, ...] = ()
     """Recipes in use by socket, of a station that gets them from the plant."""
-
-
-def stations_of(central: Central) -> list[StationStatus]:
-    """All stations, by name. Raises RecordError."""
-    with central.reading() as connection:
-        return statuses(connection)
 
 
 def statuses(connection: Connection) -> list[StationStatus]:

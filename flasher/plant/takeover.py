@@ -115,7 +115,7 @@ class Takeover:
                 with suppress(OSError):
                     for path in _with_log(part):
                         path.unlink(missing_ok=True)
-        self.key_locations.heads_file(self.station, found.records_id).append([head], found.key)
+        self.key_locations.beside_key.of(self.station, found.records_id).append([head], found.key)
         return TakenOver(self.station, found.end.number, found.runs, tuple(found.active), aside)
 
     def _make(

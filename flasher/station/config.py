@@ -305,14 +305,12 @@ def load_config(path: Path) -> StationConfig:
     return config.model_copy(update=changed)
 
 
-def mock_config(
-    count: int, units: MockUnits, *, name: str = "mock", records: str = "records.sqlite"
-) -> StationConfig:
+def mock_config(count: int, units: MockUnits) -> StationConfig:
     """Settings of a station with virtual units in sockets 1 to `count`. Raises UsageError."""
     if not 1 <= count <= SOCKETS_MAX:
         raise UsageError(f"A station has 1 to {SOCKETS_MAX} sockets, not {count}.")
     sockets = tuple(SocketConfig(name=str(number + 1), mock=units) for number in range(count))
-    return StationConfig(name=name, records=records, socket=sockets)
+    return StationConfig(name="mock", socket=sockets)
 
 
 def power_command(template: str, *, on: bool) -> list[str]:

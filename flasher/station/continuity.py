@@ -94,9 +94,9 @@ class Continuity:
         self.has_update_command = False
         """An update command was sent, and no application has answered since."""
         self.power_cycles = 0
-        self._may_restart, self._was_silent = may_restart, was_silent and not may_restart
-        """The recipe allows restarts; the bus was silent before the run, so that any start is
-        evidence."""
+        self.may_restart, self._was_silent = may_restart, was_silent and not may_restart
+        """The recipe allows restarts (`AfterRestart.CONTINUE`); the bus was silent before the run,
+        so that any start is evidence."""
         self._name = loaded.name
         self._reset_command = loaded.profile.reset_command
         self._sent = Reassembler(loaded.target.request_id, timings.inter_frame_timeout_s)
@@ -256,7 +256,7 @@ class Continuity:
         if watcher.announcements > announcements and self._is_identified:
             self._compare_boot_version()
         if watcher.answers > answers and watcher.answer is not None and self._is_identified:
-            if self._requested_s is not None and not self._may_restart:
+            if self._requested_s is not None and not self.may_restart:
                 self._lose("runs an application in the middle of its transfer")
             self._compare(watcher.answer)
 
@@ -336,7 +336,7 @@ class Continuity:
         if self._has_acted or now <= self._supplied_until:
             return
         # A socket holds its unit from the identification on; before, another one may be put in.
-        if self._may_restart and (self._is_identified or self.watcher.request is None):
+        if self.may_restart and (self._is_identified or self.watcher.request is None):
             return
         if not was_heard:
             self._lose("was silent when the run began, and announces its bootloader now")
@@ -396,12 +396,12 @@ class Continuity:
             could_be_other = was_sent and not in_burst and missed_s >= _EXCHANGE_S
         else:
             could_be_other = in_burst and missed_s > 0.0 and since_s + missed_s >= self._gap_s
-        if could_be_other and not self._may_restart and not self.unobserved:
+        if could_be_other and not self.may_restart and not self.unobserved:
             self.unobserved = _UNOBSERVED.format(f"to the {self._name} for {missed_s:.1f} s")
 
     def _lose_by_restart(self, when: str) -> None:
         self.is_running = False
-        if not self._may_restart:
+        if not self.may_restart:
             self._lose(f"announced its bootloader {when}")
 
     def _compare(self, content: Content) -> None:

@@ -48,11 +48,9 @@ class ShiftCounts:
     that its methods get.
     """
 
-    def __init__(
-        self, shifts: Sequence[time] = DEFAULT_SHIFTS, runs: Iterable[RunRecord] = ()
-    ) -> None:
+    def __init__(self, shifts: Sequence[time] = DEFAULT_SHIFTS) -> None:
         self._shifts = shifts
-        self._runs = list(runs)
+        self._runs: list[RunRecord] = []
 
     def add(self, run: RunRecord) -> None:
         self._runs.append(run)

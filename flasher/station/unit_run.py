@@ -164,7 +164,6 @@ class UnitRun:
                     taps,
                     self._is_over,
                     self._is_lost,
-                    may_restart=self._may_restart,
                 )
                 for each in self._recipe.targets
             ]

@@ -69,16 +69,13 @@ class UnitTarget:
         taps: Sequence[Tap],
         cancelled: Callable[[], bool],
         is_lost: Callable[[], bool],
-        *,
-        may_restart: bool = False,
     ) -> None:
         self.loaded = loaded
         self.name = loaded.name
         self.clock = connection.clock
         self.continuity = continuity
         self.watcher = continuity.watcher
-        self.may_restart = may_restart
-        """The recipe allows the target to restart by itself (`AfterRestart.CONTINUE`)."""
+        self.may_restart = continuity.may_restart
         self._taps = taps
         # No other program uses this adapter, and each flash listens for other tools itself.
         self.device = connection.device(
@@ -98,7 +95,7 @@ class UnitTarget:
             options=loaded.profile.upgrade_options(
                 attempts=loaded.profile.attempts,
                 waits_for_other_tool=False,
-                single_session=not may_restart,
+                single_session=not self.may_restart,
             ),
             # Units without an application are flashed too.
             identity=loaded.identity,

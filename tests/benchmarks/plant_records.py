@@ -24,7 +24,7 @@ import psycopg
 from flasher.plant.central import Central
 from flasher.plant.forwarder import Forwarder
 from flasher.plant.setup import create_database, role_of, setup
-from flasher.plant.stations import stations_of
+from flasher.plant.stations import statuses
 from flasher.plant.store import PlantStore
 from flasher.protocol.spec import BMS
 from flasher.station.records.newest import PageCursor
@@ -86,6 +86,11 @@ def _catch_up(bench: Bench, url: str, runs: int) -> None:
     )
 
 
+def _statuses(central: Central) -> object:
+    with central.reading() as connection:
+        return statuses(connection)
+
+
 def _ask(url: str, folder: Path) -> None:
     store = PlantStore.open(url, station="desk", folder=folder, read_only=True)
     with closing(store), closing(Central(url)) as central:
@@ -94,7 +99,7 @@ def _ask(url: str, folder: Path) -> None:
         questions: dict[str, Callable[[], object]] = {
             "units of an image, a page": lambda: overview.holders(sha256, PageCursor()),
             "yield of all runs, without daily sums": store.read.figures,
-            "all stations": lambda: stations_of(central),
+            "all stations": lambda: _statuses(central),
         }
         for name, ask in questions.items():
             began_s = time.perf_counter()

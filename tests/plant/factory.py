@@ -14,7 +14,7 @@ import psycopg
 from flasher.plant.central import Central
 from flasher.plant.forwarder import Forwarder
 from flasher.plant.setup import DELIVERERS, READERS, role_of, setup
-from flasher.plant.stations import StationStatus, stations_of
+from flasher.plant.stations import StationStatus, statuses
 from flasher.plant.store import PlantStore
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.store import Store
@@ -87,8 +87,8 @@ class Plant:
             return connection.execute(query.encode()).fetchall()
 
     def status(self, station: str = "line-2") -> StationStatus:
-        with closing(Central(self.url(READER))) as central:
-            return next(each for each in stations_of(central) if each.station == station)
+        with closing(Central(self.url(READER))) as central, central.reading() as connection:
+            return next(each for each in statuses(connection) if each.station == station)
 
     def store(self) -> Store:
         """The runs as reports and pages read them."""

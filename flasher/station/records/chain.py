@@ -224,17 +224,12 @@ def rows_without_run(
 
 def head_of(connection: Connection, run_id: int) -> ChainHead | None:
     """The chain head after a finished run; None without an audit row."""
-    row = connection.execute(
-        select(audit, station.c.name)
-        .join_from(audit, station)
-        .where(audit.c.run_id == run_id, audit.c.event.in_(ENDINGS))
-        .order_by(audit.c.id.desc())
-        .limit(1)
-    ).one_or_none()
-    if row is None:
+    row = ending_of(connection, run_id)
+    if not row:
         return None
-    key = key_in_force(connection, row.name, row.number)
-    return ChainHead(row.name, row.number, row.at, row.hash, row.signature, key or "")
+    key = key_in_force(connection, row["name"], row["number"])
+    facts = {name: row[name] for name in ("number", "at", "hash", "signature")}
+    return ChainHead(row["name"], **facts, key=key or "")
 
 
 def accepted_losses(connection: Connection, station_name: str) -> list[range]:
@@ -266,8 +261,12 @@ def lost_of(data: Mapping[str, Any]) -> range:
 
 
 def ending_of(connection: Connection, run_id: int) -> dict[str, Any]:
-    """Audit row of a finished run; {} without one."""
-    query = select(audit).where(audit.c.run_id == run_id, audit.c.event.in_(ENDINGS))
+    """Audit row of a finished run with the `name` of its station; {} without one."""
+    query = (
+        select(audit, station.c.name)
+        .join_from(audit, station)
+        .where(audit.c.run_id == run_id, audit.c.event.in_(ENDINGS))
+    )
     row = connection.execute(query.order_by(audit.c.id.desc()).limit(1)).mappings().one_or_none()
     return {} if row is None else dict(row)
 

@@ -13,7 +13,6 @@ from pathlib import Path
 
 from platformdirs import user_data_path
 
-from flasher.station.records.heads import HeadsFile
 from flasher.station.records.places import FolderPlace, Place, file_name, place_of
 
 
@@ -51,10 +50,6 @@ class KeyLocations:
 
     def key_file(self, station: str, records_id: str) -> Path:
         return self.keys_folder / file_name(station, records_id, ".key")
-
-    def heads_file(self, station: str, records_id: str) -> HeadsFile:
-        """The heads in the key's folder."""
-        return self.beside_key.of(station, records_id)
 
     def examined_files(self, records_id: str) -> tuple[Path, Path]:
         """Paths of the examined part of these records and of the examiner's key."""

@@ -134,19 +134,12 @@ class Copying:
     """
 
     def __init__(
-        self,
-        source: HeadsFile,
-        place: Place,
-        target: Heads,
-        key: Callable[[], SigningKey],
-        *,
-        retry_s: float = RETRY_S,
+        self, source: HeadsFile, place: Place, target: Heads, key: Callable[[], SigningKey]
     ) -> None:
         self._source = source
         self._place = place
         self._target = target
         self._key = key
-        self._retry_s = retry_s
         self._position: Position | None = None
         self._last: ChainHead | None = None
         """The last head that was copied to the place."""
@@ -182,7 +175,7 @@ class Copying:
 
     def _run(self) -> None:
         while True:
-            self._wake.wait(self._retry_s if self.fault else None)
+            self._wake.wait(RETRY_S if self.fault else None)
             self._wake.clear()
             is_ending = self._is_ending
             try:

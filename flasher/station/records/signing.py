@@ -211,7 +211,7 @@ class Signer:
 
     @cached_property
     def heads_file(self) -> HeadsFile:
-        return self.key_locations.heads_file(self._station, self.records_id)
+        return self.key_locations.beside_key.of(self._station, self.records_id)
 
     def _lasts(self) -> Iterator[tuple[Place, ChainHead]]:
         """Last heads of the places that can be reached. Raises RecordError, UsageError."""
@@ -223,7 +223,7 @@ class Signer:
                 yield place, last
 
     def _copying(self, place: Place) -> Copying:
-        source = self.key_locations.heads_file(self._station, self.records_id)
+        source = self.key_locations.beside_key.of(self._station, self.records_id)
         target = place.of(self._station, self.records_id)
         return Copying(source, place, target, self._key_now)
 
