@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Callable
+from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,11 @@ import click
 import pytest
 
 from flasher.cli import values
+from flasher.cli.extras import Actions
+from flasher.cli.framework import Group
 from flasher.cli.options import can_filter
+from flasher.cli.plant.commands import plant
+from flasher.cli.station.commands import station
 from flasher.errors import ExitCode
 from flasher.protocol.spec import BMS, OBC, TARGETS, WMC
 from tests.cli.conftest import SAMPLES, Flasher
@@ -197,3 +203,27 @@ def test_the_image_options_reach_the_loader(flasher: Flasher, tmp_path: Path) ->
     )
     assert run.document["image"]["size_bytes"] == 0x80
     assert run.document["image"]["base"] == 0x8004100
+
+
+# -- actions that are declared apart from their functions ------------------------------------------
+
+
+@each("group", [station, plant])
+def test_a_function_of_an_action_takes_the_options_of_its_declaration(
+    group: Group, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    called = []
+
+    def bind(self: Actions, action: str, *args: object, **named: object) -> int:
+        module, _, name = action.partition(".")
+        found = import_module(f"{self._package}.{module}")
+        signature(getattr(found, name)).bind(*args, **named)
+        called.append(action)
+        return 0
+
+    monkeypatch.setattr(Actions, "call", bind)
+    for command in group.commands.values():
+        names = [str(param.name) for param in command.params if param.expose_value]
+        assert command.callback is not None
+        command.callback(None, **dict.fromkeys(names))
+    assert len(called) == len(group.commands)

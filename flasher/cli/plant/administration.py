@@ -119,10 +119,10 @@ def bounds_of(options: BoundsOptions) -> Bounds:
     return Bounds(**vars(options) | {"yield_min": options.yield_min / 100})
 
 
-def status(output: Output, url: str, options: BoundsOptions) -> int:
+def status(output: Output, url: str, bounds: BoundsOptions) -> int:
     now = datetime.now().astimezone()
     with open_central(url) as central, central.reading() as connection:
-        found = overviews(connection, bounds_of(options), DEFAULT_SHIFTS, now)
+        found = overviews(connection, bounds_of(bounds), DEFAULT_SHIFTS, now)
         twice = passed_twice(connection, TWICE_MAX)
     for each in found:
         output.results(_lines(each))
@@ -199,8 +199,8 @@ def sending_of(file: Path) -> Sending:
     return Sending(config.plant, config.name, config.records, files, sockets)
 
 
-def fetch(output: Output, file: Path) -> int:
-    with closing(sending_of(file).open_fetcher()) as fetcher:
+def fetch(output: Output, sockets: Path) -> int:
+    with closing(sending_of(sockets).open_fetcher()) as fetcher:
         found = fetcher.fetch()
     for given in found.recipes:
         state = given.fault or ("fetched now" if given.digest in found.new else "was here")
@@ -213,8 +213,8 @@ def fetch(output: Output, file: Path) -> int:
     return output.document(PlantFetchDocument(found), exit_code=code)
 
 
-def send(output: Output, file: Path) -> int:
-    with closing(sending_of(file).open()) as forwarder:
+def send(output: Output, sockets: Path) -> int:
+    with closing(sending_of(sockets).open()) as forwarder:
         while forwarder.forward():
             output.progress(f"{counted(forwarder.state.unsent, 'row')} left")
         state = forwarder.state

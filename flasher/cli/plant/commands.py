@@ -5,7 +5,6 @@ Those need the extra `plant` and are imported when called.
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
@@ -13,19 +12,16 @@ from typing import Annotated, Final
 import click
 
 from flasher.cli import values
-from flasher.cli.extras import need
+from flasher.cli.extras import Actions
 from flasher.cli.framework import argument, group, option, option_set
-from flasher.cli.output import Output
 from flasher.cli.station.commands import (
     DEFAULT_DESK,
     PAGES,
-    Address,
-    PagesOptions,
     ReportOptions,
     address_of,
     pages_options,
 )
-from flasher.errors import ExitCode, UsageError
+from flasher.errors import ExitCode
 
 _EXAMPLES: Final = """\
 examples:
@@ -46,14 +42,8 @@ examples:
 """
 
 
-def __getattr__(name: str) -> tuple[type, ...]:
-    """Types of the `--json` documents, for the schema; they need the extra."""
-    if name in ("DOCUMENTS", "LINES"):
-        found: tuple[type, ...] = getattr(
-            importlib.import_module("flasher.cli.plant.documents"), name
-        )
-        return found
-    raise AttributeError(name)
+_actions: Final = Actions("flasher.cli.plant", "The plant's database", "plant")
+__getattr__ = _actions.documents
 
 
 @group(epilog=_EXAMPLES, exit_codes=(ExitCode.VERIFICATION, ExitCode.PARTIAL, ExitCode.INTERRUPTED))
@@ -64,20 +54,8 @@ def plant() -> None:
     """
 
 
-def _call(action: str, *args: object, **named: object) -> int:
-    """Run an action ("module.function") and return its exit code. Raises UsageError when the extra
-    `plant` is not installed.
-    """
-    need("The plant's database", "plant")
-    module, _, name = action.partition(".")
-    code: int = getattr(importlib.import_module(f"flasher.cli.plant.{module}"), name)(
-        *args, **named
-    )
-    return code
-
-
 _database_option: Final = option(
-    "--database", metavar="URL", required=True, brief=True,
+    "--database", "url", metavar="URL", required=True, brief=True,
     help="the plant's database: postgresql://USER@HOST/NAME",
 )  # fmt: skip
 
@@ -89,7 +67,7 @@ _database_option: Final = option(
     help="a station that may send: creates its role; may be repeated",
 )  # fmt: skip
 @option(
-    "--renew", metavar="NAME", multiple=True,
+    "--renew", "renewed", metavar="NAME", multiple=True,
     help="a station that has new records: its old ones stay, and only the new ones are accepted "
     "from now on; may be repeated",
 )  # fmt: skip
@@ -97,16 +75,9 @@ _database_option: Final = option(
     "--print", "prints", is_flag=True, brief=True,
     help="change nothing: print what an administrator of the server has to run",
 )  # fmt: skip
-def init(
-    output: Output,
-    database: str,
-    stations: tuple[str, ...],
-    renew: tuple[str, ...],
-    *,
-    prints: bool,
-) -> int:
+@_actions.calls("administration.init")
+def init() -> None:
     """Create or upgrade the database and the roles of the stations."""
-    return _call("administration.init", output, database, stations, renew, prints=prints)
 
 
 _ALERTS: Final = "bounds of alerts"
@@ -149,12 +120,12 @@ class BoundsOptions:
 @plant.action("status")
 @option_set("bounds", BoundsOptions)
 @_database_option
-def status(output: Output, bounds: BoundsOptions, database: str) -> int:
+@_actions.calls("administration.status")
+def status() -> None:
     """List the stations with their checks: last report, last row, last run, yield, unsent rows,
     clock, disk, version. Exit code 10 if the database refuses the records of one, else 12 if there
     is an alert. A check that cannot be judged, such as a yield of too few units, is "not known".
     """
-    return _call("administration.status", output, database, bounds)
 
 
 @plant.action("verify")
@@ -163,11 +134,11 @@ def status(output: Output, bounds: BoundsOptions, database: str) -> int:
     "--archive", type=values.FolderPath(), metavar="DIR", brief=True,
     help="examine the files of retired months in this folder, too",
 )  # fmt: skip
-def verify(output: Output, database: str, archive: Path | None) -> int:
+@_actions.calls("reading.verify")
+def verify() -> None:
     """Examine every audit trail with its signatures, every run against its audit rows, and every
     PASS against its trace. Exit code 10 if something was changed.
     """
-    return _call("reading.verify", output, database, archive)
 
 
 @dataclass(frozen=True)
@@ -192,14 +163,12 @@ class ClaimOptions:
 )  # fmt: skip
 @option("--reason", metavar="TEXT", brief=True, help="the reason, for the records")
 @_database_option
-def claims(
-    output: Output, options: ClaimOptions, database: str, reason: str | None, *, releases: bool
-) -> int:
+@_actions.calls("claims.claims")
+def claims() -> None:
     """List the units that stations claim and whose run has not arrived, and the claims that were
     released. While a claim exists, other stations do not know whether its unit has passed. A run
     that arrives after its claim was released is marked: duplicates not checked.
     """
-    return _call("claims.claims", output, database, options, releases=releases, reason=reason)
 
 
 @plant.action("retire")
@@ -218,48 +187,32 @@ def claims(
     "--with-problems", is_flag=True,
     help="archive records that plant verify finds fault with as they are, instead of refusing",
 )  # fmt: skip
-def retire(
-    output: Output,
-    database: str,
-    archive: Path,
-    before: str | None,
-    keep_months: int | None,
-    *,
-    dry_run: bool,
-    with_problems: bool,
-) -> int:
+@_actions.calls("retiring.retire")
+def retire() -> None:
     """Move old months from the database to files, one for each month. A month is deleted only
     after its file is on the disk and was verified. The last run of each unit, and its last
     transfer, stay. Only the owner of the database may do it; when interrupted, run it again. Exit
     code 10 if the records of a month have problems: it stays.
     """
-    if (before is None) == (keep_months is None):
-        raise UsageError(
-            "Name either --before or --keep-months.", remedy="Add --before 2024-01, for example."
-        )
-    return _call(
-        "retiring.retire", output, database, archive, before, keep_months,
-        dry_run=dry_run, with_problems=with_problems,
-    )  # fmt: skip
 
 
 @plant.action("units")
 @_database_option
 @option(
-    "--image", metavar="SHA256|VERSION", required=True, brief=True,
+    "--image", "wanted", metavar="SHA256|VERSION", required=True, brief=True,
     help="SHA-256 of the image, its beginning, or its version",
 )  # fmt: skip
-def units(output: Output, database: str, image: str) -> int:
+@_actions.calls("reading.units")
+def units() -> None:
     """List the units whose last transfer to a target was of this image, newest first."""
-    return _call("reading.units", output, database, image)
 
 
 @plant.action("report")
 @option_set("options", ReportOptions)
 @_database_option
-def report(output: Output, options: ReportOptions, database: str) -> int:
+@_actions.calls("reading.report")
+def report() -> None:
     """Show units, yield, failures and times of all stations; write them to files."""
-    return _call("reading.report", output, options, database)
 
 
 @plant.action("pages")
@@ -270,14 +223,11 @@ def report(output: Output, options: ReportOptions, database: str) -> int:
 @pages_options
 @option_set("bounds", BoundsOptions)
 @_database_option
-def pages(
-    output: Output, web: Address, pages: PagesOptions, bounds: BoundsOptions, database: str
-) -> int:
+@_actions.calls("reading.pages", also=("The supervisor pages", "web"))
+def pages() -> None:
     """Serve the supervisor pages over the records of all stations until Ctrl-C: the page of all
     stations with their alerts, and those of a station.
     """
-    need("The supervisor pages", "web")
-    return _call("reading.pages", output, web, pages, database, bounds)
 
 
 @plant.action("send")
@@ -285,11 +235,11 @@ def pages(
     "--sockets", type=values.FilePath("toml", gives=Path), required=True, brief=True,
     metavar="FILE", help="the station file (TOML), with `plant`",
 )  # fmt: skip
-def send(output: Output, sockets: Path) -> int:
+@_actions.calls("administration.send")
+def send() -> None:
     """Send what the plant's database lacks of a station's records, and end. A running station sends
     by itself.
     """
-    return _call("administration.send", output, sockets)
 
 
 @plant.action("publish")
@@ -304,21 +254,11 @@ def send(output: Output, sockets: Path) -> int:
     help="a socket that gets it (default: all of the station); may be repeated",
 )  # fmt: skip
 @_database_option
-def publish(
-    output: Output,
-    recipe: Path,
-    database: str,
-    stations: tuple[str, ...],
-    sockets: tuple[str, ...],
-    *,
-    is_all: bool,
-) -> int:
+@_actions.calls("recipes.publish")
+def publish() -> None:
     """Give a recipe with its images to stations with `plant_recipes` in their file. A station
     fetches it, and uses it after one of its supervisors has approved it there.
     """
-    if is_all == bool(stations):
-        raise UsageError("Name stations with --station, or give --all.", remedy="Choose one.")
-    return _call("recipes.publish", output, recipe, database, stations, sockets)
 
 
 @plant.action("withdraw")
@@ -328,18 +268,18 @@ def publish(
     help="the reason, for the records",
 )  # fmt: skip
 @_database_option
-def withdraw(output: Output, digest: str, database: str, reason: str) -> int:
+@_actions.calls("recipes.withdraw")
+def withdraw() -> None:
     """Withdraw a published recipe: stations begin no unit with it as soon as they know. To publish
     it again takes that back.
     """
-    return _call("recipes.withdraw", output, digest, database, reason)
 
 
 @plant.action("recipes")
 @_database_option
-def recipes(output: Output, database: str) -> int:
+@_actions.calls("recipes.recipes")
+def recipes() -> None:
     """List what was published and withdrawn, by whom and when."""
-    return _call("recipes.recipes", output, database)
 
 
 @plant.action("fetch")
@@ -347,11 +287,11 @@ def recipes(output: Output, database: str) -> int:
     "--sockets", type=values.FilePath("toml", gives=Path), required=True, brief=True,
     metavar="FILE", help="the station file (TOML), with `plant`",
 )  # fmt: skip
-def fetch(output: Output, sockets: Path) -> int:
+@_actions.calls("administration.fetch")
+def fetch() -> None:
     """Fetch the recipes that the plant gives to a station, and end. A running station does it by
     itself. Exit code 12 if one could not be fetched.
     """
-    return _call("administration.fetch", output, sockets)
 
 
 # -- to the plant's systems ------------------------------------------------------------------------
@@ -359,18 +299,18 @@ def fetch(output: Output, sockets: Path) -> int:
 
 @plant.action("deliver")
 @option(
-    "--receivers", type=values.FilePath("toml", gives=Path), required=True, brief=True,
+    "--receivers", "file", type=values.FilePath("toml", gives=Path), required=True, brief=True,
     metavar="FILE", help="the file of receivers (TOML): their addresses",
 )  # fmt: skip
 @option("--once", is_flag=True, help="end when no run is due, instead of waiting for more")
 @_database_option
-def deliver(output: Output, receivers: Path, database: str, *, once: bool) -> int:
+@_actions.calls("handover.deliver")
+def deliver() -> None:
     """Hand over the runs that arrive in the plant's database to the plant's other systems, by HTTP
     or MQTT, until Ctrl-C. Each run comes with a key; it counts once if the receiver ignores a key
     that it has already. A receiver is new when it is first in the file: it gets the runs that
     arrive from then on.
     """
-    return _call("handover.deliver", output, database, receivers, once=once)
 
 
 @dataclass(frozen=True)
@@ -415,26 +355,18 @@ class DeliveryOptions:
     help="hand no further runs over to this receiver, which is no longer in the file",
 )  # fmt: skip
 @_database_option
-def deliveries(
-    output: Output,
-    options: DeliveryOptions,
-    limit: int,
-    stop: str | None,
-    database: str,
-    *,
-    resend: bool,
-) -> int:
+@_actions.calls("handover.deliveries")
+def deliveries() -> None:
     """List what was handed over to the plant's systems, and what they answered."""
-    return _call("handover.deliveries", output, database, options, limit, resend=resend, stop=stop)
 
 
 @plant.action("reconcile")
-@argument("list_", metavar="FILE", type=values.FilePath("csv", "json", gives=Path))
+@argument("file", metavar="FILE", type=values.FilePath("csv", "json", gives=Path))
 @option("--receiver", metavar="NAME", required=True, brief=True, help="the receiver")
 @option("--resend", is_flag=True, brief=True, help="hand over again what is missing there")
 @_database_option
-def reconcile(output: Output, list_: Path, receiver: str, database: str, *, resend: bool) -> int:
+@_actions.calls("handover.reconcile")
+def reconcile() -> None:
     """Compare the keys that a receiver has, from a CSV or JSON file, with what was handed over:
     missing there, more than once there, unknown here. Exit code 10 if they differ.
     """
-    return _call("handover.reconcile", output, database, receiver, list_, resend=resend)

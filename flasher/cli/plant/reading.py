@@ -29,7 +29,7 @@ _AT_ONCE = 1000
 
 
 def records_of_plant(url: str) -> RecordsOptions:
-    return RecordsOptions(url, cache_folder(url), None, (), None)
+    return RecordsOptions(url, cache_folder(url))
 
 
 def verify(output: Output, url: str, archive: Path | None) -> int:
@@ -121,11 +121,11 @@ def report(output: Output, options: ReportOptions, url: str) -> int:
 
 
 def pages(
-    output: Output, address: Address, options: PagesOptions, url: str, bounds: BoundsOptions
+    output: Output, web: Address, pages: PagesOptions, url: str, bounds: BoundsOptions
 ) -> int:
     from flasher.cli.station.pages import serve  # noqa: PLC0415  an extra
     from flasher.web.plant import PLANT_PAGES, STATIONS, PlantPages  # noqa: PLC0415  an extra
 
     make = partial(PlantPages, bounds=bounds_of(bounds))
     paths = dict.fromkeys([STATIONS, *PLANT_PAGES])
-    return serve(output, address, options, records_of_plant(url), PlantStore, make, tuple(paths))
+    return serve(output, web, pages, records_of_plant(url), PlantStore, make, tuple(paths))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from flasher.cli.output import Output, utc_time
 from flasher.cli.plant.documents import PlantPublishDocument, PlantRecipesDocument
+from flasher.errors import UsageError
 from flasher.plant import recipes as centre
 from flasher.plant.central import open_central
 from flasher.plant.recipes import WITHDRAWN, RecipeEvent, events_of
@@ -16,10 +17,18 @@ from flasher.station.recipe_file import load_checked
 
 
 def publish(
-    output: Output, path: Path, url: str, stations: Sequence[str], sockets: Sequence[str]
+    output: Output,
+    recipe: Path,
+    url: str,
+    stations: Sequence[str],
+    sockets: Sequence[str],
+    *,
+    is_all: bool,
 ) -> int:
+    if is_all == bool(stations):
+        raise UsageError("Name stations with --station, or give --all.", remedy="Choose one.")
     day = datetime.now().astimezone().date()
-    loaded = load_checked(path, day)
+    loaded = load_checked(recipe, day)
     with open_central(url) as central:
         bundle = centre.publish(central, loaded, stations, sockets, day)
     rule = loaded.recipe

@@ -9,6 +9,7 @@ from pathlib import Path
 from flasher.cli.bar import Bar
 from flasher.cli.output import Output, byte_count, counted
 from flasher.cli.plant.documents import PlantRetireDocument
+from flasher.errors import UsageError
 from flasher.plant.archive import month_after
 from flasher.plant.central import Central
 from flasher.plant.retire import (
@@ -24,13 +25,17 @@ from flasher.protocol.text import printable
 def retire(
     output: Output,
     url: str,
-    folder: Path,
+    archive: Path,
     before: str | None,
     keep_months: int | None,
     *,
     dry_run: bool,
     with_problems: bool,
 ) -> int:
+    if (before is None) == (keep_months is None):
+        raise UsageError(
+            "Name either --before or --keep-months.", remedy="Add --before 2024-01, for example."
+        )
     if before is None:
         before = month_before(datetime.now(UTC), keep_months or 0)
     month_after(before)  # raises for what is no month
@@ -40,7 +45,7 @@ def retire(
         closing(Central(url, statement_limit_s=LIMIT_S)) as central,
         Bar(output, **look) as bar,
     ):
-        work = Retirement(central, folder, bar.move_to)
+        work = Retirement(central, archive, bar.move_to)
         if dry_run:
             due = work.months(before)
             for each in due:

@@ -65,8 +65,7 @@ def golden(
             )
         return [badge, *of_unit]
 
-    pages = PagesOptions(None, None, None, web_insecure=False, language=None)
-    return run(output, options, pages, records, golden=scans)
+    return run(output, options, PagesOptions(), records, golden=scans)
 
 
 def check(output: Output, path: Path, station_file: Path | None) -> int:

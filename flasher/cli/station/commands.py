@@ -5,8 +5,6 @@ Those need the extra `station` and are imported when called.
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -14,10 +12,10 @@ from typing import Annotated, Any, Final
 import click
 
 from flasher.cli import values
-from flasher.cli.extras import need
+from flasher.cli.extras import Actions, need
 from flasher.cli.framework import Decorator, argument, group, option, option_set
 from flasher.cli.output import Output
-from flasher.errors import ExitCode, UsageError
+from flasher.errors import ExitCode
 
 DEFAULT_RECORDS: Final = "records.sqlite"
 _EXAMPLES: Final = """\
@@ -54,14 +52,8 @@ that runs with --web serves these pages too, beside its operator page.
 """
 
 
-def __getattr__(name: str) -> tuple[type, ...]:
-    """Types of the `--json` documents, for the schema; they need the extra."""
-    if name in ("DOCUMENTS", "LINES"):
-        found: tuple[type, ...] = getattr(
-            importlib.import_module("flasher.cli.station.documents"), name
-        )
-        return found
-    raise AttributeError(name)
+_actions: Final = Actions("flasher.cli.station", "The station", "station")
+__getattr__ = _actions.documents
 
 
 @group(
@@ -73,17 +65,6 @@ def station() -> None:
     A PASS is shown only after it is on disk; years later the records still show which file was
     written to which unit, and by whom. The guide is docs/how-to/station.md.
     """
-
-
-def _call(action: str, *args: object, **named: object) -> int:
-    """Run an action ("module.function") and return its exit code. Raises UsageError when the extra
-    `station` is not installed.
-    """
-    need("The station", "station")
-    module, _, name = action.partition(".")
-    run = getattr(importlib.import_module(f"flasher.cli.station.{module}"), name)
-    code: int = run(*args, **named)
-    return code
 
 
 # -- options that actions share --------------------------------------------------------------------
@@ -103,24 +84,24 @@ class RecordsOptions:
         "--database", metavar="FILE", panel="records", brief=True,
         help="the records: an SQLite file (default: of --sockets, "
         f"else {DEFAULT_RECORDS} here)",
-    )]  # fmt: skip
+    )] = None  # fmt: skip
     files: Annotated[Path | None, _path_option(
         "--files", metavar="DIR", panel="records",
         help="the folder of traces (default: beside the file)",
-    )]  # fmt: skip
+    )] = None  # fmt: skip
     keys: Annotated[Path | None, _path_option(
         "--keys", metavar="DIR", panel="records",
         help="the folder of the signing key (default: of --sockets, else a place of this user)",
-    )]  # fmt: skip
+    )] = None  # fmt: skip
     heads: Annotated[tuple[str, ...], option(
         "--heads", metavar="DIR|URL", multiple=True, panel="records",
         help="a place for copies of the signed heads of the audit trails, in addition to the one "
         "beside the key: a folder, best on another computer, or postgresql://USER@HOST/NAME; may "
         "be repeated (default: of --sockets)",
-    )]  # fmt: skip
+    )] = ()  # fmt: skip
     sockets: Annotated[Path | None, _path_option(
         "--sockets", panel="records", brief=True, help="the station file (TOML)",
-    )]  # fmt: skip
+    )] = None  # fmt: skip
 
 
 _records_options: Final = option_set("records", RecordsOptions)
@@ -184,22 +165,22 @@ class PagesOptions:
     web_password: Annotated[Path | None, _path_option(
         "--web-password", panel=PAGES,
         help="a file with the password of the pages in its first line",
-    )]  # fmt: skip
+    )] = None  # fmt: skip
     web_certificate: Annotated[Path | None, _path_option(
         "--web-certificate", panel=PAGES,
         help="serve the pages over TLS with this certificate (PEM)",
-    )]  # fmt: skip
+    )] = None  # fmt: skip
     web_key: Annotated[Path | None, _path_option(
         "--web-key", panel=PAGES, help="the key of the certificate (PEM)",
-    )]  # fmt: skip
+    )] = None  # fmt: skip
     web_insecure: Annotated[bool, option(
         "--web-insecure", is_flag=True, panel=PAGES,
         help="allow other computers without TLS: anyone on the network can read the traffic",
-    )]  # fmt: skip
+    )] = False  # fmt: skip
     language: Annotated[str | None, option(
         "--language", type=click.Choice(("en", "de", "zh")), panel=PAGES,
         help="language of the pages (default: the browser's)",
-    )]  # fmt: skip
+    )] = None  # fmt: skip
 
 
 pages_options: Final = option_set("pages", PagesOptions)
@@ -213,68 +194,68 @@ class RunOptions:
         "--recipe", brief=True,
         help="the recipe (TOML): steps, images and limits of a unit; with `plant_recipes` in the "
         "station file it is used until a recipe of the plant is approved",
-    )]  # fmt: skip
+    )] = None  # fmt: skip
     ignore_approved: Annotated[bool, option(
         "--ignore-approved", is_flag=True,
         help="begin with --recipe although a recipe of the plant was approved; it is recorded",
-    )]  # fmt: skip
+    )] = False  # fmt: skip
     operator: Annotated[str | None, option(
         "--operator", metavar="NAME", brief=True, help="name of the operator (default: the login)",
-    )]  # fmt: skip
+    )] = None  # fmt: skip
     lot: Annotated[str, option(
         "--lot", default="", metavar="NAME", show_default=False, help="the lot of the units",
-    )]  # fmt: skip
+    )] = ""  # fmt: skip
     badges: Annotated[Path | None, _path_option(
         "--badges", help="the badge table of the people who may work here (default: of --sockets)"
-    )]  # fmt: skip
+    )] = None  # fmt: skip
     scans: Annotated[Path | None, _path_option(
         "--scans", help="a file with a label on each line, in the order of the units; the station "
         "ends after the last",
-    )]  # fmt: skip
+    )] = None  # fmt: skip
     lines: Annotated[bool, option(
         "--lines", is_flag=True, help="print a line for each event, even on a terminal",
-    )]  # fmt: skip
+    )] = False  # fmt: skip
     web: Annotated[Address | None, option(
         "--web", type=address_of, is_flag=False, flag_value=DEFAULT_WEB, metavar="[[HOST:]PORT]",
         panel=PAGES, brief=True, show_default=False,
         help="serve the operator and supervisor pages (without a value: on this computer only, "
         f"port {DEFAULT_WEB})",
-    )]  # fmt: skip
+    )] = None  # fmt: skip
     mix_virtual: Annotated[bool, option(
         "--mix-virtual", is_flag=True, panel="records",
         help="allow real and virtual units in the same records (with different serial numbers)",
-    )]  # fmt: skip
+    )] = False  # fmt: skip
     mock_sockets: Annotated[int | None, option(
         "--mock-sockets", type=values.count, metavar="N", panel=_VIRTUAL, brief=True,
         help="use N sockets with virtual units",
-    )]  # fmt: skip
+    )] = None  # fmt: skip
     units: Annotated[int | None, option(
         "--units", type=values.count, metavar="N", panel=_VIRTUAL, brief=True,
         help="end after N virtual units",
-    )]  # fmt: skip
+    )] = None  # fmt: skip
     scan_by_hand: Annotated[bool, option(
         "--scan-by-hand", is_flag=True, panel=_VIRTUAL,
         help="show the labels of virtual units, to be typed",
-    )]  # fmt: skip
+    )] = False  # fmt: skip
     mock_bad: Annotated[float, _mock_share_option(
         "bad", 0.15, "refuse the image, or have the wrong hardware",
-    )]  # fmt: skip
-    mock_slow: Annotated[float, _mock_share_option("slow", 0.1, "take longer")]
-    mock_dead: Annotated[float, _mock_share_option("dead", 0.05, "never answer")]
+    )] = 0.0  # fmt: skip
+    mock_slow: Annotated[float, _mock_share_option("slow", 0.1, "take longer")] = 0.0
+    mock_dead: Annotated[float, _mock_share_option("dead", 0.05, "never answer")] = 0.0
     mock_exchanged: Annotated[float, _mock_share_option(
         "exchanged", 0.0, "are exchanged for the next one while being flashed",
-    )]  # fmt: skip
+    )] = 0.0  # fmt: skip
     mock_mislabelled: Annotated[float, _mock_share_option(
         "mislabelled", 0.0, "have the label of another unit",
-    )]  # fmt: skip
+    )] = 0.0  # fmt: skip
     mock_seed: Annotated[int, option(
         "--mock-seed", type=values.number, default="2", metavar="N", panel=_VIRTUAL,
         help="seed of the virtual units; another one gives other units",
-    )]  # fmt: skip
+    )] = 1  # fmt: skip
     mock_speed: Annotated[float, option(
         "--mock-speed", type=values.speed, default=1.0, metavar="X", panel=_VIRTUAL,
         help="speed relative to a real bus; 0: no delays",
-    )]  # fmt: skip
+    )] = 1.0  # fmt: skip
 
 
 @station.action("check")
@@ -294,15 +275,9 @@ def check(
     code 12 if it did not pass.
     """
     if golden is None:
-        return _call("check.check", output, recipe, sockets)
-    options = RunOptions(
-        recipe=recipe, ignore_approved=False, operator=None, lot="", badges=None, scans=None,
-        lines=True, web=None, mix_virtual=False, mock_sockets=None, units=None, scan_by_hand=False,
-        mock_bad=0.0, mock_slow=0.0, mock_dead=0.0, mock_exchanged=0.0, mock_mislabelled=0.0,
-        mock_seed=1, mock_speed=1.0,
-    )  # fmt: skip
-    records = RecordsOptions(None, None, None, (), sockets)
-    return _call("check.golden", output, options, records, golden, socket)
+        return _actions.call("check.check", output, recipe, sockets)
+    options, records = RunOptions(recipe=recipe, lines=True), RecordsOptions(sockets=sockets)
+    return _actions.call("check.golden", output, options, records, golden, socket)
 
 
 @station.action("run", epilog=_RUN_NOTES)
@@ -313,7 +288,7 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
     """Flash units until Ctrl-C, or until all scans or virtual units are done."""
     if options.web is not None:
         need("The operator page", "web")
-    return _call("run.run", output, options, pages, records)
+    return _actions.call("run.run", output, options, pages, records)
 
 
 @station.action("pages", epilog=_PAGES_NOTES)
@@ -323,18 +298,17 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
 )  # fmt: skip
 @pages_options
 @_records_options
-def pages(output: Output, web: Address, pages: PagesOptions, records: RecordsOptions) -> int:
+@_actions.calls("pages.serve", also=("The supervisor pages", "web"))
+def pages() -> None:
     """Serve the supervisor pages of records until Ctrl-C: runs, units, yield, causes, times,
     images, audit trail. It does not change the records, and needs no running station.
     """
-    need("The supervisor pages", "web")
-    return _call("pages.serve", output, web, pages, records)
 
 
 @station.action("pin")
-def pin(output: Output) -> int:
+@_actions.calls("setup.pin")
+def pin() -> None:
     """Ask for a PIN, without showing it, and print its hash for the badge table."""
-    return _call("setup.pin", output)
 
 
 @dataclass(frozen=True)
@@ -384,38 +358,30 @@ class ReportOptions:
 @station.action("report")
 @option_set("options", ReportOptions)
 @_records_options
-def report(output: Output, options: ReportOptions, records: RecordsOptions) -> int:
+@_actions.calls("records.report")
+def report() -> None:
     """Show units, yield, failures, times and the capability of measurements with limits (Cpk, Ppk);
     write them to files; make certificates.
     """
-    return _call("records.report", output, options, records)
 
 
 @station.action("unit")
 @argument("serial", metavar="SERIAL", help="its serial number")
 @option("--part", metavar="NAME", help="where several parts have this number")
-@option("--story", is_flag=True, brief=True, help="each trace explained in full")
-@_path_option("--certificate", help="write its page to print (HTML)")
+@option("--story", "full", is_flag=True, brief=True, help="each trace explained in full")
+@_path_option("--certificate", "page", help="write its page to print (HTML)")
 @_records_options
-def unit(
-    output: Output,
-    serial: str,
-    part: str | None,
-    *,
-    story: bool,
-    certificate: Path | None,
-    records: RecordsOptions,
-) -> int:
+@_actions.calls("records.unit")
+def unit() -> None:
     """Show the whole history of a unit, with its traces."""
-    return _call("records.unit", output, records, serial, part, certificate, full=story)
 
 
 @station.action("backup")
 @argument("file", type=values.FilePath(gives=Path), metavar="FILE", help="the file to write")
 @_records_options
-def backup(output: Output, file: Path, records: RecordsOptions) -> int:
+@_actions.calls("maintenance.backup")
+def backup() -> None:
     """Copy the records while the station runs."""
-    return _call("maintenance.backup", output, records, file)
 
 
 @station.action("verify")
@@ -435,8 +401,8 @@ def verify(
 ) -> int:
     """Check whether records, or a certificate, were changed after they were written."""
     if certificate is not None:
-        return _call("maintenance.verify_certificate", output, records, certificate)
-    return _call("maintenance.verify", output, records, is_all=is_all)
+        return _actions.call("maintenance.verify_certificate", output, records, certificate)
+    return _actions.call("maintenance.verify", output, records, is_all=is_all)
 
 
 @station.action("key")
@@ -445,19 +411,9 @@ def verify(
 @_operator_option
 @_reason_option(required=False)
 @_records_options
-def key(
-    output: Output,
-    *,
-    rotate: bool,
-    lost: bool,
-    operator: str | None,
-    reason: str | None,
-    records: RecordsOptions,
-) -> int:
+@_actions.calls("maintenance.key")
+def key() -> None:
     """Show, or change, the key that signs the records."""
-    if rotate and lost:
-        raise UsageError("--rotate and --lost cannot be combined.", remedy="Remove one of them.")
-    return _call("maintenance.key", output, records, operator, reason, rotate=rotate, lost=lost)
 
 
 @station.action("accept")
@@ -470,11 +426,9 @@ def key(
 @_operator_option
 @_reason_option(required=True)
 @_records_options
-def accept(
-    output: Output, what: str, operator: str | None, reason: str, records: RecordsOptions
-) -> int:
+@_actions.calls("maintenance.accept")
+def accept() -> None:
     """Let a station continue after a problem, and record who decided it."""
-    return _call("maintenance.accept", output, records, what, operator, reason)
 
 
 _station_file: Final = option(
@@ -495,17 +449,11 @@ _passphrase_option: Final = _path_option(
     help="a recipe to put in, with its images; may be repeated",
 )  # fmt: skip
 @_passphrase_option
-def export(
-    output: Output,
-    file: Path,
-    sockets: Path,
-    recipes: tuple[Path, ...],
-    passphrase_file: Path | None,
-) -> int:
+@_actions.calls("spare.export")
+def export() -> None:
     """Seal the station's signing key and settings in one file for a spare PC, encrypted with a
     passphrase. Records are not in it: a spare PC takes them from the plant's database.
     """
-    return _call("spare.export", output, sockets, recipes, file, passphrase_file)
 
 
 @station.action("take-over")
@@ -525,24 +473,12 @@ def export(
 @_passphrase_option
 @_operator_option
 @_reason_option(required=True)
-def take_over(
-    output: Output,
-    sockets: Path,
-    url: str,
-    sealed: Path | None,
-    archive: Path | None,
-    passphrase_file: Path | None,
-    operator: str | None,
-    reason: str,
-) -> int:
+@_actions.calls("spare.take_over", also=("Taking a station over", "plant"))
+def take_over() -> None:
     """Let this PC continue a station from the plant's database. The PC that ran it before is
     refused from then on; to take the station back, run this there. Settings that are missing here
     are taken from the export.
     """
-    need("Taking a station over", "plant")
-    return _call(
-        "spare.take_over", output, sockets, url, sealed, archive, passphrase_file, operator, reason
-    )
 
 
 @station.action("bring-in")
@@ -553,17 +489,15 @@ def take_over(
 @_operator_option
 @_reason_option(required=True)
 @_records_options
-def bring_in(
-    output: Output, file: Path, operator: str | None, reason: str, records: RecordsOptions
-) -> int:
+@_actions.calls("spare.bring")
+def bring_in() -> None:
     """Bring in what another PC recorded as this station after the station was taken over: runs,
     traces, and every signed row as it was.
     """
-    return _call("spare.bring", output, records, file, operator, reason)
 
 
 @station.action("upgrade")
 @_records_options
-def upgrade(output: Output, records: RecordsOptions) -> int:
+@_actions.calls("maintenance.upgrade")
+def upgrade() -> None:
     """Migrate records of an older flasher. The file is backed up first."""
-    return _call("maintenance.upgrade", output, records)

@@ -152,6 +152,8 @@ def key(
     rotate: bool,
     lost: bool,
 ) -> int:
+    if rotate and lost:
+        raise UsageError("--rotate and --lost cannot be combined.", remedy="Remove one of them.")
     with closing(open_as_station(records, changes=rotate or lost)) as store:
         if lost:
             if not reason:

@@ -174,8 +174,8 @@ def _plant_checks(station: Station) -> Collection[HealthCheck]:
 
 def serve(
     output: Output,
-    address: Address,
-    options: PagesOptions,
+    web: Address,
+    pages: PagesOptions,
     records: RecordsOptions,
     kind: type[Store] = Store,
     make: Callable[[Store, Sequence[dtime]], SupervisorPages] = SupervisorPages,
@@ -188,21 +188,21 @@ def serve(
     people = BADGES.load(Path(badges)).person if badges else ()
     with closing(open_to_read(records, kind)) as store:  # fails before the pages are served
         place = place_of(store)
-    pages = Pages(options.language)
+    shown = Pages(pages.language)
     answering = QueryProcesses(partial(serve_supervisor, *place, shifts, kind, make))
 
     async def start(_request: Request) -> Response:
         return RedirectResponse(paths[0], 303)
 
-    routes = [Route("/", start), *answer_routes(pages, answering.ask, paths, [CHECK])]
+    routes = [Route("/", start), *answer_routes(shown, answering.ask, paths, [CHECK])]
     with (
         closing(answering),
         stop_on_signal() as stopped,
         served(
-            options,
-            address,
+            pages,
+            web,
             routes,
-            pages=pages,
+            pages=shown,
             key_locations=None,
             people=people,
             is_supervised=lambda _path: True,

@@ -38,7 +38,11 @@ _PASSPHRASE_MAX_SIZE = 4096
 
 
 def export(
-    output: Output, sockets: Path, recipes: tuple[Path, ...], file: Path, passphrase: Path | None
+    output: Output,
+    sockets: Path,
+    recipes: tuple[Path, ...],
+    file: Path,
+    passphrase_file: Path | None,
 ) -> int:
     check_writable(file, "FILE")
     config = load_config(sockets)
@@ -55,7 +59,7 @@ def export(
             left_out.append(str(path))
             continue
         members[name] = read(path, EXPORT_MAX_SIZE)
-    records = RecordsOptions(None, None, None, (), sockets)
+    records = RecordsOptions(sockets=sockets)
     with closing(open_as_station(records, changes=False)) as store:
         key = store.signer.key_file
         if not key.exists():
@@ -65,7 +69,7 @@ def export(
                 remedy="Put the key file back, or start the station once, which makes it.",
             )
         members[KEY_NAME] = read(key, KEY_MAX_SIZE)
-    seal(file, members, _passphrase(passphrase, repeat=True))
+    seal(file, members, _passphrase(passphrase_file, repeat=True))
     output.result(printable(f"{file}: {config.name}, {counted(len(members), 'file')}, sealed"))
     for each in left_out:
         output.result(printable(f"  NOT in it, as it is not beside the station file: {each}"))
@@ -82,8 +86,8 @@ def take_over(
     sockets: Path,
     url: str,
     sealed: Path | None,
-    archives: Path | None,
-    passphrase: Path | None,
+    archive: Path | None,
+    passphrase_file: Path | None,
     operator: str | None,
     reason: str,
 ) -> int:
@@ -93,7 +97,7 @@ def take_over(
     from flasher.plant.takeover import Takeover  # noqa: PLC0415
 
     plant_location(url)
-    members = {} if sealed is None else unseal(sealed, _passphrase(passphrase, repeat=False))
+    members = {} if sealed is None else unseal(sealed, _passphrase(passphrase_file, repeat=False))
     key = members.pop(KEY_NAME, None)
     written = list(_unpack(members, sockets))
     config = load_config(sockets)
@@ -103,7 +107,7 @@ def take_over(
             where=printable(str(sockets)),
             remedy='Add plant = "postgresql://USER@HOST/NAME"; flasher plant init prints the line.',
         )
-    records = RecordsOptions(None, None, None, (), sockets)
+    records = RecordsOptions(sockets=sockets)
     place, clock, who = records_of(records), SystemClock(), operator_of(operator)
     location = locate_records(place.url, place.files)
     _check_alone(location, config.name)
@@ -111,7 +115,7 @@ def take_over(
     lock.acquire()
     try:
         found = Takeover(
-            config.name, url, config.plant, location, place.key_locations, who, reason, archives
+            config.name, url, config.plant, location, place.key_locations, who, reason, archive
         ).run(key, clock.utc)
     finally:
         lock.release()
