@@ -17,10 +17,9 @@ import logging
 import platform
 import random
 import time
-from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import islice
 from math import log2
@@ -183,16 +182,15 @@ class Result:
         if self.campaign != other.campaign:
             raise ValueError(f"results of two campaigns: {self.campaign} and {other.campaign}")
         violations = sorted({*self.violations, *other.violations})
-        names = self.tallies.keys() | other.tallies.keys()
+        more = {
+            name: self.tallies.get(name, Tally()) + tally for name, tally in other.tallies.items()
+        }
         return Result(
             campaign=self.campaign,
             runs=self.runs + other.runs,
             corpus_runs=self.corpus_runs + other.corpus_runs,
             endings=_sum(self.endings, other.endings),
-            tallies={
-                name: self.tallies.get(name, Tally()) + other.tallies.get(name, Tally())
-                for name in sorted(names)
-            },
+            tallies=dict(sorted({**self.tallies, **more}.items())),
             reached=with_readings({*self.reached, *other.reached}),
             violations=tuple(violations[:VIOLATIONS_MAX]),
             violation_count=self.violation_count + other.violation_count,
@@ -296,21 +294,10 @@ def run_batch(batch: Batch, is_stopped: Callable[[], bool] = lambda: False) -> R
     """
     check_code(batch, campaign_key(batch.subject, batch.target))
     began_s = time.process_time()
-    sums = _Sums()
     with without_log():
-        if batch.canary:
-            sums.hunt(batch, is_stopped)
-        else:
-            with recorded_cells() as cells:
-                for seed in range(batch.first, batch.first + batch.count):
-                    if is_stopped():
-                        break
-                    plan = batch.plan_of(seed)
-                    verdict = play(plan, bench=batch.bench)
-                    sums.add(seed - CORPUS_SEEDS * batch.is_corpus, plan, verdict)
-            sums.reached |= cells
+        total = _hunt(batch, is_stopped) if batch.canary else _played(batch, is_stopped)
     check_code(batch, campaign_key(batch.subject, batch.target))
-    return sums.result(batch.campaign, time.process_time() - began_s)
+    return replace(total, cpu_s=time.process_time() - began_s)
 
 
 def check_code(batch: Batch, key: str) -> None:
@@ -341,81 +328,63 @@ def without_log() -> Iterator[None]:
         logging.disable(before)
 
 
-class _Sums:
-    """Result that is being added up."""
-
-    def __init__(self) -> None:
-        self.reached: set[str] = set()
-        self._runs = self._corpus_runs = self._excused = self._canary_runs = self._digest = 0
-        self._endings: Counter[str] = Counter()
-        self._tallies: defaultdict[str, Counter[str]] = defaultdict(Counter)
-        self._times: defaultdict[str, Counter[int]] = defaultdict(Counter)
-        self._found: list[Found] = []
-        self._canaries: dict[bool, Counter[str]] = {True: Counter(), False: Counter()}
-        self._latest = 0.0
-
-    def add(self, seed: int, plan: plans.Plan, verdict: Verdict) -> None:
-        self.reached |= verdict.reached
-        self.reached.add(exit_place(verdict.exit_code))
-        self._latest = max(self._latest, verdict.lateness)
-        text = f"{seed} {verdict.wire} {verdict.ending} {verdict.left} {verdict.recovered}"
-        self._digest ^= int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
-        for each in verdict.violations:
-            if each.is_excused:
-                self._excused += 1
-            else:
-                self._found.append(Found(seed, each.kind, each.text, str(plan)))
-        if seed < 0:
-            self._corpus_runs += 1
-            return
-        self._runs += 1
-        self._endings[verdict.ending] += 1
-        how = "good" if verdict.is_good else f"by_{verdict.recovered}" if verdict.recovered else ""
-        for name in {each.NAME for each in plan.events} or {NO_FAULT}:
-            tally = self._tallies[name]
-            tally["runs"] += 1
-            if how:
-                tally[how] += 1
-            if verdict.is_good and verdict.share_of_bus_time:
-                time_class = round(_TIMES_PER_OCTAVE * log2(verdict.share_of_bus_time))
-                self._times[name][time_class] += 1
-
-    def hunt(self, batch: Batch, is_stopped: Callable[[], bool]) -> None:
-        """Play plans with a planted mistake until one shows it."""
-        bug = next(each for each in upgrade_bugs() if each.name == batch.canary)
-        with swapped(bug.codes()):
-            for seed in range(batch.first, batch.first + batch.count):
-                if is_stopped():
-                    return
-                self._canary_runs += 1
-                violations = play(batch.plan_of(seed), bench=batch.bench).violations
-                if any(not each.is_excused for each in violations):
-                    self._canaries[True][bug.name] += 1
-                    return
-        self._canaries[False][bug.name] += 1
-
-    def result(self, campaign: str, cpu_s: float) -> Result:
-        return Result(
-            campaign=campaign,
-            runs=self._runs,
-            corpus_runs=self._corpus_runs,
-            endings=_sorted(self._endings),
-            tallies={
-                name: Tally(**counts, times=_sorted(self._times[name]))
-                for name, counts in sorted(self._tallies.items())
-            },
-            reached=with_readings(self.reached - {""}),
-            violations=tuple(sorted(set(self._found))[:VIOLATIONS_MAX]),
-            violation_count=len(self._found),
-            excused=self._excused,
-            canaries_found=_sorted(self._canaries[True]),
-            canaries_missed=_sorted(self._canaries[False]),
-            canary_runs=self._canary_runs,
-            digest=f"{self._digest:016x}",
-            latest=self._latest,
-            cpu_s=cpu_s,
-        )
+def _played(batch: Batch, is_stopped: Callable[[], bool]) -> Result:
+    total = Result(batch.campaign)
+    with recorded_cells() as cells:
+        for seed in range(batch.first, batch.first + batch.count):
+            if is_stopped():
+                break
+            plan = batch.plan_of(seed)
+            verdict = play(plan, bench=batch.bench)
+            number = seed - CORPUS_SEEDS * batch.is_corpus
+            total += _result_of(batch.campaign, number, plan, verdict)
+    return total + Result(batch.campaign, reached=tuple(cells - {""}))
 
 
-def _sorted(counts: Mapping[Key, int]) -> dict[Key, int]:
-    return dict(sorted(counts.items()))
+def _result_of(campaign: str, seed: int, plan: plans.Plan, verdict: Verdict) -> Result:
+    """Return the result of one run; `seed` as in `Found`."""
+    text = f"{seed} {verdict.wire} {verdict.ending} {verdict.left} {verdict.recovered}"
+    found = tuple(
+        Found(seed, each.kind, each.text, str(plan))
+        for each in verdict.violations
+        if not each.is_excused
+    )
+    result = Result(
+        campaign,
+        reached=(*verdict.reached, exit_place(verdict.exit_code)),
+        violations=found,
+        violation_count=len(found),
+        excused=len(verdict.violations) - len(found),
+        digest=hashlib.sha256(text.encode()).hexdigest()[:16],
+        latest=verdict.lateness,
+    )
+    if seed < 0:
+        return replace(result, corpus_runs=1)
+    is_good, times = verdict.is_good, {}
+    if is_good and verdict.share_of_bus_time:
+        times = {round(_TIMES_PER_OCTAVE * log2(verdict.share_of_bus_time)): 1}
+    tally = Tally(
+        runs=1,
+        good=int(is_good),
+        by_flash=int(not is_good and verdict.recovered == "flash"),
+        by_rescue=int(not is_good and verdict.recovered == "rescue"),
+        times=times,
+    )
+    names = {each.NAME for each in plan.events} or {NO_FAULT}
+    return replace(result, runs=1, endings={verdict.ending: 1}, tallies=dict.fromkeys(names, tally))
+
+
+def _hunt(batch: Batch, is_stopped: Callable[[], bool]) -> Result:
+    """Play plans with a planted mistake until one shows it."""
+    bug = next(each for each in upgrade_bugs() if each.name == batch.canary)
+    runs = 0
+    with swapped(bug.codes()):
+        while runs < batch.count:
+            if is_stopped():
+                return Result(batch.campaign, canary_runs=runs)
+            plan = batch.plan_of(batch.first + runs)
+            runs += 1
+            violations = play(plan, bench=batch.bench).violations
+            if any(not each.is_excused for each in violations):
+                return Result(batch.campaign, canaries_found={bug.name: 1}, canary_runs=runs)
+    return Result(batch.campaign, canaries_missed={bug.name: 1}, canary_runs=runs)
