@@ -82,6 +82,9 @@ class Clause:
     NAME: ClassVar[str]
     when: When | None = None
 
+    def __init_subclass__(cls) -> None:
+        cls.NAME = vars(cls).get("NAME", cls.__name__.lower())
+
     def __str__(self) -> str:
         words = [] if self.when is None else [str(self.when)]
         words.append(self.NAME)
@@ -100,7 +103,6 @@ class Clause:
 class Job(Clause):
     """The upgrade, and whether anybody else is on the bus. 0 in a limit is the default."""
 
-    NAME = "job"
     target: Literal["bms", "wmc", "obc"] = "bms"
     packets: Annotated[int, NumberRange(ge=1, le=PACKET_COUNT_MAX)] = 20
     short: Annotated[int, NumberRange(ge=0, le=PACKET_DATA_SIZE - 1)] = 5
@@ -120,7 +122,6 @@ class Job(Clause):
 class Adapter(Clause):
     """How the host's adapter returns its own frames, and how many it queues."""
 
-    NAME = "adapter"
     echoes: bool = False
     delay: float = 0.0
     """Seconds from the end of a frame to its echo."""
@@ -154,8 +155,6 @@ class Device(Clause):
 class Independent(Device):
     """A device that was written from the document alone; its choices are fields of `Choices`."""
 
-    NAME = "independent"
-
     def chosen(self) -> Choices:
         return Choices(**_values(Choices, self.choices.split()))
 
@@ -163,8 +162,6 @@ class Independent(Device):
 @dataclass(frozen=True, kw_only=True)
 class Mock(Device):
     """flasher's own device model; its choices are fields of `DeviceProfile`."""
-
-    NAME = "mock"
 
     def chosen(self) -> DeviceProfile:
         profile = {"application_area_bytes": "131072"}
@@ -176,14 +173,11 @@ class Mock(Device):
 class Subject(Device):
     """The bootloader under test; a plan chooses nothing for it."""
 
-    NAME = "subject"
-
 
 @dataclass(frozen=True, kw_only=True)
 class Load(Clause):
     """Other traffic, one frame every so many seconds; id 0 wins every arbitration."""
 
-    NAME = "load"
     id: Annotated[int, NumberRange(ge=0, le=0x7FF)] = 0x712
     every: Interval = 0.002
     seconds: float = 3600.0
@@ -204,14 +198,11 @@ class OnFrames(Clause):
 class Drop(OnFrames):
     """Nobody receives it."""
 
-    NAME = "drop"
-
 
 @dataclass(frozen=True, kw_only=True)
 class Double(OnFrames):
     """It arrives twice."""
 
-    NAME = "double"
     whole: bool = False
     """The frames of a message arrive again after its last one, as over a second way."""
 
@@ -220,14 +211,11 @@ class Double(OnFrames):
 class Swap(OnFrames):
     """It arrives after the next frame of the same sender."""
 
-    NAME = "swap"
-
 
 @dataclass(frozen=True, kw_only=True)
 class Delay(OnFrames):
     """It arrives later: frames that were sent after it overtake it."""
 
-    NAME = "delay"
     seconds: float = 0.001
 
 
@@ -235,7 +223,6 @@ class Delay(OnFrames):
 class Flip(OnFrames):
     """One bit is wrong, and the checksum of the CAN frame does not detect it."""
 
-    NAME = "flip"
     bit: Annotated[int, NumberRange(ge=0, le=63)] = 0
 
 
@@ -243,7 +230,6 @@ class Flip(OnFrames):
 class Truncate(OnFrames):
     """Only its first `to` bytes arrive."""
 
-    NAME = "truncate"
     to: Annotated[int, NumberRange(ge=0, le=8)] = 3
 
 
@@ -251,7 +237,6 @@ class Truncate(OnFrames):
 class Noise(Clause):
     """For a time, shares of all frames are lost, wrong, doubled, or reported as error frames."""
 
-    NAME = "noise"
     seconds: float = 0.5
     sender: Sender = "any"
     lost: Share = 0.0
@@ -268,7 +253,6 @@ class Noise(Clause):
 class Unsolicited(Clause):
     """A message of the device that nobody asked for, valid, from another sender."""
 
-    NAME = "unsolicited"
     what: Literal["ack", "nak", "boot", "request", "complete", "feedback", "unknown"] = "nak"
     """`unknown` is a message of no document."""
     number: int = 1
@@ -286,7 +270,6 @@ class OnDevice(Clause):
 class Answer(OnDevice):
     """The next answer of the device is another one, or comes later."""
 
-    NAME = "answer"
     becomes: Literal["same", "ack", "nak", "silence", "twice"] = "same"
     """An ACK becomes a NAK of the same number, and the reverse; `twice`: it is sent twice, unless
     it is general feedback."""
@@ -301,7 +284,6 @@ class Answer(OnDevice):
 class Power(OnDevice):
     """Its supply fails."""
 
-    NAME = "power"
     seconds: float = 1.0
 
 
@@ -309,14 +291,11 @@ class Power(OnDevice):
 class Restart(OnDevice):
     """Its supply dips: it restarts at once."""
 
-    NAME = "restart"
-
 
 @dataclass(frozen=True, kw_only=True)
 class Hang(OnDevice):
     """It neither receives nor sends."""
 
-    NAME = "hang"
     seconds: float = 2.0
 
 
@@ -335,7 +314,6 @@ class FlashFails(OnDevice):
 class Unplug(Clause):
     """The adapter is removed; it comes back, for `wrong_rate` seconds at another bit rate."""
 
-    NAME = "unplug"
     seconds: float = 0.4
     wrong_rate: float = 0.0
 
@@ -344,7 +322,6 @@ class Unplug(Clause):
 class BusOff(Clause):
     """The adapter's controller is off."""
 
-    NAME = "busoff"
     seconds: float = 0.3
 
 
@@ -352,7 +329,6 @@ class BusOff(Clause):
 class Tool(Clause):
     """A second tool sends."""
 
-    NAME = "tool"
     does: Literal[
         "asks",
         "writes",
@@ -378,7 +354,6 @@ class Tool(Clause):
 class Stall(Clause):
     """The host's computer pauses."""
 
-    NAME = "stall"
     seconds: float = 1.0
 
 
@@ -386,7 +361,6 @@ class Stall(Clause):
 class Kill(Clause):
     """The host's process dies; the same command runs so much later, with the history alone."""
 
-    NAME = "kill"
     again: float = 1.0
     rescue: bool = False
     """`flasher rescue` runs then instead, with an operator who follows its prompts."""
@@ -395,8 +369,6 @@ class Kill(Clause):
 @dataclass(frozen=True, kw_only=True)
 class Interrupt(Clause):
     """Ctrl-C."""
-
-    NAME = "interrupt"
 
 
 # -- the text -------------------------------------------------------------------------------------

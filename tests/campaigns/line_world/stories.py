@@ -76,7 +76,6 @@ class Person(Clause):
     `mounted`: the scanners at the sockets.
     """
 
-    NAME = "person"
     name: str
     source: str = "page"
 
@@ -102,7 +101,6 @@ class Put(Act):
 class Pull(Act):
     """Take the unit out of the socket that it is in."""
 
-    NAME = "pull"
     unit: int
 
 
@@ -115,7 +113,6 @@ class Scan(Act):
 class Card(Scan):
     """Scan the card of the socket that the unit is in; of `socket`, while it is in the hand."""
 
-    NAME = "card"
     unit: int
     socket: str = ""
 
@@ -135,7 +132,6 @@ class Cancel(Scan):
 class Free(Scan):
     """Scan FREE of a socket that is empty."""
 
-    NAME = "free"
     socket: str
 
 
@@ -143,7 +139,6 @@ class Free(Scan):
 class Abort(Scan):
     """Scan ABORT of a socket."""
 
-    NAME = "abort"
     socket: str
 
 
@@ -151,14 +146,10 @@ class Abort(Scan):
 class Resume(Scan):
     """Scan RESUME, when the line has stopped."""
 
-    NAME = "resume"
-
 
 @dataclass(frozen=True, kw_only=True)
 class Look(Act):
     """Do nothing: time passes."""
-
-    NAME = "look"
 
 
 # -- what befalls them -----------------------------------------------------------------------------
@@ -168,7 +159,6 @@ class Look(Act):
 class Sleep(Act):
     """A unit neither hears nor speaks for a time; its supply stays on."""
 
-    NAME = "sleep"
     unit: int
     seconds: float = 3.0
 
@@ -177,7 +167,6 @@ class Sleep(Act):
 class Dip(Act):
     """The supply of a socket fails for a time."""
 
-    NAME = "dip"
     socket: str
     seconds: float = 0.5
 
@@ -186,7 +175,6 @@ class Dip(Act):
 class Stall(Act):
     """The process of a socket stands still for a time."""
 
-    NAME = "stall"
     socket: str
     seconds: float = 1.0
 
@@ -217,7 +205,6 @@ class KillPower(Act):
 class Unplug(Act):
     """The adapter of a socket is pulled out for a time."""
 
-    NAME = "unplug"
     socket: str
     seconds: float = 1.0
 
