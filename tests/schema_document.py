@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from flasher.cli.schema import build
+from tests.schema import build
 
 if TYPE_CHECKING:
     from jsonschema import Draft202012Validator

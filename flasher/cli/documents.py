@@ -4,7 +4,7 @@ A type that a command prints is printed as it is, or with the keys of
 `flasher.validation.json_keys`. Only a view that differs from it is a document, a frozen dataclass
 of the command's module. Each module lists the types that it prints as `DOCUMENTS`, and those of
 lines before the document as `LINES`. `flasher.cli.output` puts them into the `Envelope`,
-`flasher.cli.schema` makes a JSON Schema of them.
+`tests.schema` makes a JSON Schema of them.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 A sweep has parts, each with its number of cases known before it runs. The places are those of the
 upgrade without faults, which is played first: its frames, messages and flash operations. `limits`
-has a plan just before, at and just after each time limit; `NOT_REACHED` names those that no plan
-reaches. `crc` plays nothing: `crc_errors` decides for all errors of a few bits.
+has a plan just before, at and just after each time limit. `crc` plays nothing: `crc_errors` decides
+for all errors of a few bits.
 """
 
 from __future__ import annotations
@@ -75,17 +75,6 @@ _UNITS: Final[Mapping[str, str]] = {"restart": "reset_delay_s", "start": "start_
     "session": "transfer_timeout_s",
 }
 """Choices of the independent device, and what `mock` calls them."""
-NOT_REACHED: Final[Mapping[str, str]] = {
-    "packet_tries": "a number, not a time",
-    "end_tries": "a number, not a time",
-    "power_up_timeout_s": "the operator of a simulation follows each prompt within 4 s",
-    "frame_gap_s": "a pause that the user asks for; no answer is awaited in it",
-    "packet_gap_s": "a pause that the user asks for; no answer is awaited in it",
-    "refused_hold_s": "the host has ended before a device that refused announces itself",
-    "verification by memory": "plans verify by version",
-}
-"""Limits that no plan reaches, with the reason."""
-
 Case = Plan | ErrorsOfSize
 
 

@@ -14,10 +14,10 @@ import pytest
 from flasher import events
 from flasher.cli.logs import Logs
 from flasher.cli.output import Output
-from flasher.cli.schema import event_classes
 from flasher.events import Phase
 from flasher.log import describe, level_of, log_event
 from tests.cli.conftest import SAMPLES, Flasher
+from tests.schema import event_classes
 
 OBC = SAMPLES / "obc.bin"
 FULL = Path("/dev/full")

@@ -17,11 +17,11 @@ from flasher import events
 from flasher.cli.documents import to_json
 from flasher.cli.main import COMMANDS
 from flasher.cli.output import Output
-from flasher.cli.schema import command_modules, event_classes
 from flasher.protocol.contents import UserString
 from flasher.protocol.fields import WireText
 from tests import schema_document
 from tests.cli.conftest import SAMPLES, Flasher
+from tests.schema import command_modules, event_classes
 
 MOCK = ("-t", "bms", "--mock", "--mock-speed", "0")
 OBC = SAMPLES / "obc.bin"

@@ -11,9 +11,9 @@ from typing import Literal
 import pytest
 from pydantic import PydanticUserError, TypeAdapter, ValidationError
 
-from flasher.cli.schema import schema_of
 from flasher.documents import adapter, as_json
 from flasher.validation import LowerCaseInJson, json_keys
+from tests.schema import schema_of
 from tests.schema_document import mismatches
 
 

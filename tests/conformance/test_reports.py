@@ -11,7 +11,6 @@ import pytest
 
 from flasher.cli.bench.conformance import ConformanceDocument
 from flasher.cli.bench.conformance_text import report_lines
-from flasher.cli.schema import schema_of
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import CASES, MISSING_ON_BARE_BENCH, Requirement, Selection
 from flasher.conformance.html_report import MESSAGES_BAD, html_page
@@ -41,6 +40,7 @@ from flasher.conformance.summary_page import summary_page
 from flasher.mock.store import AREA_START
 from tests.loops import each
 from tests.report.pages import Page, assert_self_contained, assert_visible
+from tests.schema import schema_of
 from tests.schema_document import mismatches
 
 from .bench import PROFILE, fails_once, passes_once, run_case

@@ -18,7 +18,6 @@ from pydantic import BaseModel
 from sphinx.application import Sphinx
 from sphinx.util.typing import ExtensionMetadata
 
-from flasher.cli import schema
 from flasher.cli.framework import CommandEntry, Program
 from flasher.cli.help import HelpedCommand
 from flasher.cli.main import PURPOSES, flasher
@@ -27,6 +26,7 @@ from flasher.release import trust
 from flasher.settings import bike_set, bus, device_model, manifest, profile
 from flasher.settings.toml_reader import Key, Reader
 from flasher.station import codes, config, operators, recipe
+from tests import schema
 
 _MADE: Final = re.compile(r"^<!-- made: (\S+) ?(.*) -->$", re.MULTILINE)
 _Lines = Iterator[str]

@@ -31,7 +31,7 @@ class _Generator(GenerateJsonSchema):
     def field_title_should_be_set(self, schema: Any) -> bool:
         return False
 
-    def field_is_required(self, field: Any, total: bool) -> bool:  # noqa: FBT001  pydantic's
+    def field_is_required(self, field: Any, total: bool) -> bool:
         return True
 
     def dataclass_schema(self, schema: core_schema.DataclassSchema) -> Schema:
