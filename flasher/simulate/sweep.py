@@ -90,16 +90,12 @@ class Part:
     cases: Callable[[], Iterator[Case]]
     """Plans, or errors of messages; each prints as the line that repeats it."""
 
-    def taken(self, every: int, first: int = 0) -> Part:
-        """Return the part with the cases `first`, `first + every`, ... only: a sample, or the share
-        of one of `every` processes. Raises ValueError unless 0 <= first < every.
-        """
-        if not 0 <= first < every:
-            raise ValueError(f"there is no part {first} of {every}")
+    def taken(self, every: int) -> Part:
+        """Return the part with every so many cases only."""
         return replace(
             self,
-            count=len(range(first, self.count, every)),
-            cases=lambda: islice(self.cases(), first, None, every),
+            count=len(range(0, self.count, every)),
+            cases=lambda: islice(self.cases(), 0, None, every),
         )
 
 
