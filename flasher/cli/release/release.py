@@ -5,6 +5,8 @@ from __future__ import annotations
 import datetime
 import hashlib
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -222,15 +224,14 @@ def build_(
             )
         parts[target] = _part(image, target, product, counter)
     chain = _read_chain(trust)
-    with_log = _locked_log(ledger)
-    with with_log:
+    with _locked_log(ledger) as earlier:
         raw, log = build(
             parts,
             released=released or today(),
             notes=_document(notes, "release notes"),
             sbom=_document(sbom, "SBOM"),
             chain=chain,
-            log=with_log.log,
+            log=earlier,
             log_keys=open_keys(log_keys, passphrases),
             is_detached=detached,
         )
@@ -310,35 +311,23 @@ def _read_chain(path: str | None) -> Chain | None:
     return parse_chain(read(path, CHAIN_MAX_SIZE, what="trust file"), path).check()
 
 
-class _locked_log:  # noqa: N801  a context manager
-    """Log of releases, which no other build appends to meanwhile."""
-
-    def __init__(self, path: str | None) -> None:
-        self._path = path
-        self._lock = FileLock(f"{path}.lock", timeout=_LOG_LOCK_S) if path else None
-        self.log: ReleaseLog | None = None
-
-    def __enter__(self) -> None:
-        if self._lock is None or self._path is None:
-            return
-        try:
-            self._lock.acquire()
-        except (OSError, Timeout) as error:
-            raise UsageError(
-                f"The log of releases {printable(self._path)} cannot be locked.",
-                cause="another build uses it, or its folder does not exist or is read-only",
-                remedy="Run one build after the other.",
-                code=ErrorCode.FILE_NOT_WRITTEN,
-            ) from error
-        try:
-            self.log = _read_log(self._path)
-        except BaseException:
-            self._lock.release()
-            raise
-
-    def __exit__(self, *_: object) -> None:
-        if self._lock is not None:
-            self._lock.release()
+@contextmanager
+def _locked_log(path: str | None) -> Iterator[ReleaseLog | None]:
+    """Yield the log of releases, if any, which no other build appends to meanwhile."""
+    if not path:
+        yield None
+        return
+    try:
+        held = FileLock(f"{path}.lock", timeout=_LOG_LOCK_S).acquire()
+    except (OSError, Timeout) as error:
+        raise UsageError(
+            f"The log of releases {printable(path)} cannot be locked.",
+            cause="another build uses it, or its folder does not exist or is read-only",
+            remedy="Run one build after the other.",
+            code=ErrorCode.FILE_NOT_WRITTEN,
+        ) from error
+    with held:
+        yield _read_log(path)
 
 
 def _read_log(path: str) -> ReleaseLog:
