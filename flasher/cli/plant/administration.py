@@ -18,8 +18,9 @@ from flasher.cli.plant.documents import (
     PlantSendDocument,
     PlantStatusDocument,
 )
+from flasher.cli.station.place import station_of_plant
 from flasher.cli.station.records import passed_twice_lines
-from flasher.errors import ExitCode, UsageError
+from flasher.errors import ExitCode
 from flasher.plant.alerts import (
     Bounds,
     CheckKind,
@@ -35,7 +36,6 @@ from flasher.plant.setup import create_database, role_of, setup
 from flasher.plant.store import passed_twice
 from flasher.protocol.text import printable
 from flasher.report.scale import share_text
-from flasher.station.config import load_config
 from flasher.station.records.database import Location
 from flasher.station.records.model import RunState, Units
 from flasher.station.reports import TWICE_MAX
@@ -187,13 +187,7 @@ def _yield_text(found: Units) -> str:
 
 def sending_of(file: Path) -> Sending:
     """What a station file asks to send. Raises UsageError."""
-    config = load_config(file)
-    if not config.plant:
-        raise UsageError(
-            "The station file names no plant.",
-            where=printable(str(file)),
-            remedy='Add plant = "postgresql://USER@HOST/NAME"; flasher plant init prints the line.',
-        )
+    config = station_of_plant(file)
     files = Path(config.files) if config.files else None
     sockets = tuple(each.name for each in config.socket)
     return Sending(config.plant, config.name, config.records, files, sockets)

@@ -10,7 +10,7 @@ from typing import Any, Final
 from flasher.cli.station.commands import DEFAULT_RECORDS, RecordsOptions
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
-from flasher.station.config import load_config
+from flasher.station.config import StationConfig, load_config
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import DEFAULT_LOCK_TIMEOUT_S
 from flasher.station.records.store import Store
@@ -70,6 +70,18 @@ def _path(text: str) -> Path | None:
 def open_to_read(options: RecordsOptions, kind: type[Store] = Store) -> Store:
     """Open the records for reading only. Raises UsageError, RecordError."""
     return records_of(options).open(_READER, read_only=True, kind=kind)
+
+
+def station_of_plant(file: Path) -> StationConfig:
+    """Read a station file that names a plant. Raises UsageError."""
+    config = load_config(file)
+    if not config.plant:
+        raise UsageError(
+            "The station file names no plant.",
+            where=printable(str(file)),
+            remedy='Add plant = "postgresql://USER@HOST/NAME"; flasher plant init prints the line.',
+        )
+    return config
 
 
 def the_station(names: tuple[str, ...]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
 import sys
 from collections.abc import Iterator
 from contextlib import closing
@@ -13,7 +12,8 @@ from flasher.cli.output import Output, counted
 from flasher.cli.station.commands import RecordsOptions
 from flasher.cli.station.documents import BroughtInDocument, ExportDocument, TakenOverDocument
 from flasher.cli.station.maintenance import open_as_station
-from flasher.cli.station.place import operator_of, records_of
+from flasher.cli.station.place import operator_of, records_of, station_of_plant
+from flasher.cli.station.setup import ask_secret
 from flasher.errors import UsageError
 from flasher.files import TOML_MAX_SIZE, read
 from flasher.protocol.text import printable
@@ -100,13 +100,7 @@ def take_over(
     members = {} if sealed is None else unseal(sealed, _passphrase(passphrase_file, repeat=False))
     key = members.pop(KEY_NAME, None)
     written = list(_unpack(members, sockets))
-    config = load_config(sockets)
-    if not config.plant:
-        raise UsageError(
-            "The station file names no plant.",
-            where=printable(str(sockets)),
-            remedy='Add plant = "postgresql://USER@HOST/NAME"; flasher plant init prints the line.',
-        )
+    config = station_of_plant(sockets)
     records = RecordsOptions(sockets=sockets)
     place, clock, who = records_of(records), SystemClock(), operator_of(operator)
     location = locate_records(place.url, place.files)
@@ -223,10 +217,8 @@ def _passphrase(file: Path | None, *, repeat: bool) -> str:
     """The passphrase from a file, a terminal, or the first line of a pipe. Raises UsageError."""
     if file is not None:
         return read(file, _PASSPHRASE_MAX_SIZE).decode("utf-8", "replace").strip()
-    if sys.stdin is None or not sys.stdin.isatty():
-        typed = "" if sys.stdin is None else sys.stdin.readline().strip()
-    else:
-        typed = getpass.getpass("Passphrase: ").strip()
-        if repeat and getpass.getpass("Repeat the passphrase: ").strip() != typed:
-            raise UsageError("The two passphrases differ.", remedy="Run the command again.")
+    typed = ask_secret("Passphrase: ")
+    is_typed = sys.stdin is not None and sys.stdin.isatty()
+    if repeat and is_typed and ask_secret("Repeat the passphrase: ") != typed:
+        raise UsageError("The two passphrases differ.", remedy="Run the command again.")
     return typed
