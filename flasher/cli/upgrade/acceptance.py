@@ -6,7 +6,7 @@ import datetime
 import json
 import shlex
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from enum import Enum
@@ -228,13 +228,6 @@ def _now() -> str:
     return datetime.datetime.now().astimezone().isoformat(timespec="seconds")
 
 
-@dataclass
-class _Done:
-    """What a step that passed has to say."""
-
-    what: str = ""
-
-
 class _StepError(Exception):
     """A step failed, and the later ones make no sense."""
 
@@ -268,8 +261,7 @@ class _Walk:
         self._is_practice = self.bus.mock
         self._hardware = "the built-in mock" if self.bus.mock else "the adapter was not opened"
         try:
-            with self._step("bus") as done:
-                done.what = self._look_at_bus()
+            self._try("bus", self._look_at_bus)
             with self.bus.connect(target, profile=None) as connection:
                 if not self.bus.mock:
                     self._hardware = printable(connection.name)
@@ -277,8 +269,7 @@ class _Walk:
                 device = connection.device(
                     target, dialect=self.bus.dialect, profile=self.profile, cancelled=self.stop
                 )
-                with self._step("identity") as done:
-                    done.what = self._identify(device)
+                self._try("identity", lambda: self._identify(device))
                 self._read(device)
                 self._upgrades(connection, device)
         except _StepError:
@@ -330,24 +321,25 @@ class _Walk:
 
     def _read(self, device: api.Device) -> None:
         """Read all items twice."""
-        assert self._before is not None  # noqa: S101  set by the step before
-        node = self.job.plan.target.node.name
-        if not self._before.readings:
+        before, node = self._before, self.job.plan.target.node.name
+        assert before is not None  # noqa: S101  set by the step before
+        if not before.readings:
             why = f"the documents let no tool read the {node}"
             self._leave_out("read", StepState.IMPOSSIBLE, why)
             self._impossible = {"read", STEPS[-1]}
-            return
-        with self._step("read") as done:
-            again = device.identify()
-            names = [each.title for each in again.readings if each.answer is not None]
-            missing = [each.title for each in again.readings if each.answer is None]
-            self._details += [f"answered: {', '.join(names)}"] if names else []
-            self._details += [f"not answered: {', '.join(missing)}"] if missing else []
-            if not names:
-                raise _StepError("no query was answered")
-            if again.version != self._before.version:
-                raise _StepError("two identities in a row differ")
-            done.what = f"{len(names)} of {len(again.readings)} queries answered, twice"
+        else:
+            self._try("read", lambda: self._read_again(device.identify(), before))
+
+    def _read_again(self, again: api.DeviceInfo, before: api.DeviceInfo) -> str:
+        names = [each.title for each in again.readings if each.answer is not None]
+        missing = [each.title for each in again.readings if each.answer is None]
+        self._details += [f"answered: {', '.join(names)}"] if names else []
+        self._details += [f"not answered: {', '.join(missing)}"] if missing else []
+        if not names:
+            raise _StepError("no query was answered")
+        if again.version != before.version:
+            raise _StepError("two identities in a row differ")
+        return f"{len(names)} of {len(again.readings)} queries answered, twice"
 
     def _upgrades(self, connection: api.Connection, device: api.Device) -> None:
         """Flash twice, then interrupt and rescue, each only if the person agrees."""
@@ -359,8 +351,7 @@ class _Walk:
                 self._leave_out(name, StepState.NOT_TRIED, "the person did not agree")
             return
         for name in ("first upgrade", "second upgrade"):
-            with self._step(name) as done:
-                done.what = self._flash(connection, self.job)
+            self._try(name, lambda: self._flash(connection, self.job))
         if not (
             self.interrupts
             if self.agreed
@@ -372,13 +363,11 @@ class _Walk:
             why = "not requested" if self.agreed else "the person did not agree"
             self._leave_out("interrupted and rescued", StepState.NOT_TRIED, why)
         else:
-            with self._step("interrupted and rescued") as done:
-                done.what = self._interrupt_and_rescue(connection)
+            self._try("interrupted and rescued", lambda: self._interrupt_and_rescue(connection))
         if STEPS[-1] in self._impossible:
             self._leave_out(STEPS[-1], StepState.IMPOSSIBLE, "the documents give no query for it")
         else:
-            with self._step(STEPS[-1]) as done:
-                done.what = self._compare(device.identify())
+            self._try(STEPS[-1], lambda: self._compare(device.identify()))
 
     def _flash(
         self, connection: api.Connection, job: api.Job, *, until_packet: int | None = None
@@ -477,16 +466,15 @@ class _Walk:
     def _asks(self, question: str) -> bool:
         return agrees(question, interrupted=self.device_state)
 
-    @contextmanager
-    def _step(self, name: str) -> Iterator[_Done]:
-        """Add a step when the block ends, however it ends."""
+    def _try(self, name: str, act: Callable[[], str]) -> None:
+        """Run a step, which returns what it has to say, and add it, however it ends."""
         self._name(name)
-        self._details, done = [], _Done()
+        self._details = []
         begun = time.perf_counter()
         state, what = StepState.STOPPED, "interrupted at once"
         try:
-            yield done
-            state, what = StepState.PASSED, done.what
+            what = act()
+            state = StepState.PASSED
         except _StepError as error:
             state, what = StepState.FAILED, str(error)
             raise
