@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Concatenate, ParamSpec
+from typing import Any, Concatenate, ParamSpec
 
 from flasher.api import Job
 from flasher.cli.look.backup import backup_folder
@@ -24,6 +24,7 @@ from flasher.settings.manifest import manifest_path, to_toml
 from flasher.web.archive import PAGES as KEPT
 from flasher.web.archive import Archive
 from flasher.web.bench import BenchController, Order
+from flasher.web.bench_backend import UpgradeEnding
 from flasher.web.bench_compare import watch_compared
 from flasher.web.bench_page import BenchPage, Shelf, upload_limit
 from flasher.web.bench_state import Adapter, BenchState
@@ -61,14 +62,19 @@ class HeldBikes(VirtualBikes):
 
     hold: Callable[[object], None] = staticmethod(lambda _event: None)
 
-    def _listener(
-        self, adapter: Adapter, job: Job, on_event: Callable[[object], None]
-    ) -> Callable[[object], None]:
+    def upgrade(
+        self,
+        adapter: Adapter,
+        job: Job,
+        *args: Any,
+        on_event: Callable[[object], None],
+        **more: Any,
+    ) -> UpgradeEnding:
         def held(event: object) -> None:
             on_event(event)
             self.hold(event)
 
-        return super()._listener(adapter, job, held)
+        return super().upgrade(adapter, job, *args, on_event=held, **more)
 
 
 def order(

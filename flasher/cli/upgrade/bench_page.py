@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Final
+from typing import Any, Final
 
 import click
 from platformdirs import user_state_path
@@ -164,16 +164,12 @@ class _Place:
         cancelled: Callable[[], bool],
     ) -> UpgradeEnding:
         output = self._output
-        job = self._begun(adapter, job)
 
         @contextmanager
         def watching(connection: Connection, record: Recording) -> Iterator[CallOptions]:
             output.progress(f"{job.plan.target.node.name} on {connection.name} ...")
-            yield {
-                "on_event": self._listener(adapter, job, on_event),
-                "cancelled": cancelled,
-                "hung_up": partial(record.hung_up, self._stop, output),
-            }
+            hung_up = partial(record.hung_up, self._stop, output)
+            yield {"on_event": on_event, "cancelled": cancelled, "hung_up": hung_up}
 
         upgrade_run = UpgradeRun(job, self.bus(adapter), RecordingOptions(), output)
         upgrade_run.keeps_settings = keeps_settings
@@ -183,22 +179,8 @@ class _Place:
             result = upgrade_run.write_planned(connect, watching)
         except FlasherError as error:
             upgrade_run.error = error
-        self._ended(adapter)
         bundle = None if upgrade_run.record is None else upgrade_run.record.bundle
         return UpgradeEnding(result, upgrade_run.error, bundle, upgrade_run.warning)
-
-    def _begun(self, _adapter: Adapter, job: Job) -> Job:
-        """Return the upgrade to run."""
-        return job
-
-    def _listener(
-        self, _adapter: Adapter, _job: Job, on_event: Callable[[object], None]
-    ) -> Callable[[object], None]:
-        """Create the listener for events of an upgrade that begins."""
-        return on_event
-
-    def _ended(self, _adapter: Adapter) -> None:
-        """End an upgrade."""
 
 
 @dataclass
@@ -275,24 +257,27 @@ class VirtualBikes(_Place):
     def connect(self, adapter: Adapter, *, asks: bool = True) -> AbstractContextManager[Connection]:
         return self._bikes[adapter.name].connect()
 
-    def _begun(self, _adapter: Adapter, job: Job) -> Job:
-        """Limit the attempts, to show a bike's fault before the overall deadline."""
-        return replace(job, options=replace(job.options, attempts=DEFAULT_ATTEMPTS))
-
-    def _ended(self, adapter: Adapter) -> None:
-        self._bikes[adapter.name].ended()
-
-    def _listener(
-        self, adapter: Adapter, job: Job, on_event: Callable[[object], None]
-    ) -> Callable[[object], None]:
+    def upgrade(
+        self,
+        adapter: Adapter,
+        job: Job,
+        connect: Callable[[], AbstractContextManager[Connection]],
+        *,
+        on_event: Callable[[object], None],
+        **more: Any,
+    ) -> UpgradeEnding:
+        """Upgrade with few attempts, to show a bike's fault before the overall deadline."""
         bike = self._bikes[adapter.name]
+        job = replace(job, options=replace(job.options, attempts=DEFAULT_ATTEMPTS))
         bike.begin(job)
 
         def listener(event: object) -> None:
             on_event(event)
             bike.happened(event)
 
-        return listener
+        ending = super().upgrade(adapter, job, connect, on_event=listener, **more)
+        bike.ended()
+        return ending
 
 
 def serve(
