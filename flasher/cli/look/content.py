@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from flasher.cli.documents import HeardDocument, content_document
+from flasher.cli.documents import HeardDocument, content_document, document_of
 from flasher.cli.output import counted
 from flasher.cli.terminal import columns
 from flasher.host.survey import NodeTraffic
@@ -55,11 +55,11 @@ def heard_lines(heard: NodeTraffic, *, contents: bool = False) -> list[str]:
 
 
 def heard_document(heard: NodeTraffic) -> HeardDocument:
-    return HeardDocument(
-        frames=heard.frames,
+    return document_of(
+        HeardDocument,
+        heard,
         messages=dict(sorted(heard.messages.items())),
         last={title: content_document(content) for title, content in heard.last.items()},
-        damaged=heard.damaged,
         boot_version=heard.boot_version or None,
         not_in_dialect=sorted(heard.not_in_dialect),
     )

@@ -12,6 +12,7 @@ from typing import Final
 import click
 
 from flasher.cli import values
+from flasher.cli.documents import document_of
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.framework import Decorator, argument, group, option, option_set
 from flasher.cli.output import Output, counted
@@ -627,12 +628,10 @@ def _show(output: Output, chain: Chain, warnings: list[str] | None = None) -> in
     for each in warnings or ():
         output.error_line(f"warning: {each}")
     return output.document(
-        TrustDocument(
+        document_of(
+            TrustDocument,
+            newest,
             file=chain.source,
-            name=newest.name,
-            version=newest.version,
-            issued=newest.issued,
-            expires=newest.expires,
             holders={key_id: key.holder for key_id, key in newest.keys.items()},
             roles=[
                 RoleDocument(name, role.threshold, list(role.keys))

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
+from flasher.cli.documents import document_of
 from flasher.cli.files import check_writable
 from flasher.cli.output import Output, counted
 from flasher.cli.station.commands import RecordsOptions
@@ -136,11 +137,9 @@ def take_over(
         if forwarder.error is not None:
             output.progress(f"not all is sent to the plant: {printable(forwarder.error.what)}")
     return output.document(
-        TakenOverDocument(
-            station=found.station,
-            rows=found.rows,
-            runs=found.runs,
-            active=found.active,
+        document_of(
+            TakenOverDocument,
+            found,
             set_aside=None if found.set_aside is None else str(found.set_aside),
             written=written,
             brought_in=brought,
