@@ -33,6 +33,7 @@ frames, the computer's scheduler.
 _OWN_FRAMES: Final = 256
 _SWITCH: Final = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
 _FILE: Final = "{file}"
+_READBACK_LIMIT_S: Final = 60.0
 _READBACK_MAX_SIZE: Final = 64 * 1024 * 1024
 """In bytes, far more than a device has."""
 
@@ -184,21 +185,20 @@ class ReadbackCommand:
     the application area to a file. Raises UsageError for a command without `{file}`.
     """
 
-    def __init__(self, template: str, limit_s: float = 60.0) -> None:
+    def __init__(self, template: str) -> None:
         if _FILE not in template:
             raise UsageError(
                 f"The readback command {template!a} has no {{file}}.",
                 remedy="Write {file} in place of the output file.",
             )
         self._template = _split(template, "readback")
-        self._limit_s = limit_s
 
     def __call__(self) -> bytes:
         """Run the command and read its file. Raises BusError."""
         with tempfile.TemporaryDirectory() as directory:
             path = Path(directory) / "readback.bin"
             words = [word.replace(_FILE, str(path)) for word in self._template]
-            _run(words, self._limit_s, "readback")
+            _run(words, _READBACK_LIMIT_S, "readback")
             try:
                 return read(path, _READBACK_MAX_SIZE)
             except UsageError as error:

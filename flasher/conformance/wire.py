@@ -289,6 +289,7 @@ class Encoder:
 
 _FIRMWARE_AT: Final = slice(48, 64)
 """The fourth of the four texts in version information."""
+_PARTIAL_TIMEOUT_S: Final = 0.1
 _BOOT_VERSION_TEXT: Final = re.compile(rb"V\d\.\d\.\d")
 
 
@@ -376,9 +377,8 @@ class DeviceDecoder:
     A message starts at the start of a CAN frame (R19); bytes after its tail are padding.
     """
 
-    def __init__(self, encoder: Encoder, partial_timeout_s: float = 0.1) -> None:
+    def __init__(self, encoder: Encoder) -> None:
         self._ids = encoder
-        self._timeout_s = partial_timeout_s
         self._partial: dict[int, tuple[float, float, bytes]] = {}
 
     def feed(self, frame: RawFrame, at: float) -> Iterator[Received]:
@@ -388,7 +388,7 @@ class DeviceDecoder:
         if not frame.is_payload or can_id & 0x7F0 != self._ids.to_all:
             return
         first_at, last_at, so_far = self._partial.pop(can_id, (at, at, b""))
-        if so_far and at - last_at > self._timeout_s:
+        if so_far and at - last_at > _PARTIAL_TIMEOUT_S:
             yield Received(Reply.DAMAGED, first_at, last_at, can_id, so_far)
             first_at, so_far = at, b""
         if not so_far and not frame.data.startswith(b"\x55\xaa"):

@@ -282,11 +282,9 @@ class IndependentDevice:
     def _alarm(self, at: float, act: Callable[[float], None]) -> None:
         heapq.heappush(self._alarms, (at, next(self._order), act))
 
-    def _say(
-        self, command: int, data: bytes, now: float, can_id: int | None = None, copies: int = 1
-    ) -> None:
+    def _say(self, command: int, data: bytes, now: float, can_id: int | None = None) -> None:
         frames = frames_of(self._says_id if can_id is None else can_id, REPORT, command, data)
-        self._outbox.extend((now + self._choices.late, frame) for frame in frames * copies)
+        self._outbox.extend((now + self._choices.late, frame) for frame in frames)
 
     # -- what it hears ---------------------------------------------------------------------------
 

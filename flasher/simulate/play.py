@@ -130,7 +130,6 @@ class Player:
     def __init__(
         self,
         plan: plans.Plan,
-        options: UpgradeOptions | None = None,
         *,
         bench: SubjectBench | None = None,
         log: Callable[[str], object] | None = None,
@@ -145,7 +144,7 @@ class Player:
         self._identity = Identity() if bench is None else bench.identity
         self.image_plan = self._image_plan()
         self.units: list[Unit] = []
-        self._options = _options(job, options or UpgradeOptions())
+        self._options = _options(job)
         self._log = log
         self._tap = tap
         self._link: PlanLink | None = None
@@ -635,7 +634,8 @@ class Player:
         return [unit for unit in self.units if unit in self.bus.units]
 
 
-def _options(job: plans.Job, options: UpgradeOptions) -> UpgradeOptions:
+def _options(job: plans.Job) -> UpgradeOptions:
+    options = UpgradeOptions()
     if job.attempts:
         options = replace(options, attempts=job.attempts)
     if job.gap:
@@ -665,12 +665,10 @@ def _reported_by(result: Result) -> Reported:
     )
 
 
-def play(
-    plan: plans.Plan, options: UpgradeOptions | None = None, bench: SubjectBench | None = None
-) -> Verdict:
+def play(plan: plans.Plan, bench: SubjectBench | None = None) -> Verdict:
     """Play a plan. An exception of the code under test is a violation."""
     try:
-        return Player(plan, options, bench=bench).play()
+        return Player(plan, bench=bench).play()
     except Exception as error:  # noqa: BLE001  a finding
         return _failed(plan, "crash", Violation("CRASH", f"{type(error).__name__}: {error}"))
 

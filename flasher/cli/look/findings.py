@@ -37,7 +37,7 @@ from flasher.protocol import contents
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import FRAMES_PER_PACKET, Dialect, Node
 from flasher.protocol.text import printable
-from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
+from flasher.protocol.timing import DEFAULT_TIMINGS as TIMES
 from flasher.trace.decoder import bits_of
 from flasher.trace.figures import Distribution
 from flasher.wording import wording
@@ -432,7 +432,7 @@ def _nodes(heard: ListenResult) -> Iterator[Finding]:
 # -- speed -----------------------------------------------------------------------------------------
 
 
-def throughput(found: Throughput, timings: Timings = DEFAULT_TIMINGS) -> Iterator[Finding]:
+def throughput(found: Throughput) -> Iterator[Finding]:
     """Judge the speed of the adapter, and name the profile keys that it needs."""
     sent = f"{counted(found.frames_sent, 'frame')} sent, all of them version queries to the BMS"
     yield _note("speed", sent)
@@ -445,7 +445,7 @@ def throughput(found: Throughput, timings: Timings = DEFAULT_TIMINGS) -> Iterato
         what = f"longest pause of this computer: {found.worst_pause_s * 1000:.1f} ms"
         yield _ok("speed", what)
     if found.worst_gap_out_s is not None:
-        yield from _sending(found, timings)
+        yield from _sending(found)
     if found.echo_delay is not None:
         what = f"own frames are returned after {spread_ms(found.echo_delay)} ms"
         yield _ok("speed", f"{what} (min/median/p95/p99/max)")
@@ -453,18 +453,18 @@ def throughput(found: Throughput, timings: Timings = DEFAULT_TIMINGS) -> Iterato
         what = "no answer was measured: only sending is known"
         yield _warning("speed", what, ("switch the system on (press its key)",))
         return
-    yield from _answers(found, found.round_trip, timings)
+    yield from _answers(found, found.round_trip)
 
 
-def _sending(found: Throughput, timings: Timings) -> Iterator[Finding]:
+def _sending(found: Throughput) -> Iterator[Finding]:
     rate = found.frames_out_per_s
     out = "at once" if rate is None else f"at {rate:,.0f} frames/s"
     queued = "" if rate is not None and rate <= found.line_frames_per_s else ", and queues them"
     gap_s = found.worst_gap_out_s or 0.0
     what = f"accepts frames {out} (the line: {found.line_frames_per_s:,.0f}){queued}, "
     what += f"longest gap {gap_s * 1000:.1f} ms"
-    if gap_s > FRAME_GAP_SHARE * timings.inter_frame_timeout_s:
-        limit = f"{timings.inter_frame_timeout_s * 1000:.0f} ms"
+    if gap_s > FRAME_GAP_SHARE * TIMES.inter_frame_timeout_s:
+        limit = f"{TIMES.inter_frame_timeout_s * 1000:.0f} ms"
         yield _problem(
             "speed",
             f"{what}: a device drops a message whose frames are {limit} apart, and no setting of "
@@ -475,7 +475,7 @@ def _sending(found: Throughput, timings: Timings) -> Iterator[Finding]:
         yield _ok("speed", what)
 
 
-def _answers(found: Throughput, trip: Distribution, timings: Timings) -> Iterator[Finding]:
+def _answers(found: Throughput, trip: Distribution) -> Iterator[Finding]:
     what = f"round trip {spread_ms(trip)} ms (min/median/p95/p99/max), the device's own time "
     yield _ok("speed", f"{what}included; {found.answered} of {found.queries} answered")
     if found.worst_gap_in_s is not None:
@@ -484,24 +484,24 @@ def _answers(found: Throughput, trip: Distribution, timings: Timings) -> Iterato
         what = f"delivers answers {how}, longest gap {found.worst_gap_in_s * 1000:.1f} ms"
         yield _ok("speed", what)
     needed = {}
-    if (found.worst_gap_in_s or 0.0) > timings.inter_frame_timeout_s / 2:
+    if (found.worst_gap_in_s or 0.0) > TIMES.inter_frame_timeout_s / 2:
         needed["inter_frame_timeout_s"] = 3 * (found.worst_gap_in_s or 0.0)
-    if trip.maximum_s > timings.ack_timeout_s / 2:
+    if trip.maximum_s > TIMES.ack_timeout_s / 2:
         needed["ack_timeout_s"] = 3 * trip.maximum_s
-    if trip.maximum_s > timings.command_repeat_s:
+    if trip.maximum_s > TIMES.command_repeat_s:
         needed["command_repeat_s"] = 2 * trip.maximum_s
-        needed["command_timeout_s"] = max(timings.command_timeout_s, 6 * trip.maximum_s)
+        needed["command_timeout_s"] = max(TIMES.command_timeout_s, 6 * trip.maximum_s)
     if needed:
         keys = tuple(f"{key} = {ceil(value * 10) / 10:g}" for key, value in needed.items())
         what = "slow for the default limits; a profile needs"
         yield _warning("speed", what, ("[timings]", *keys))
     else:
         yield _ok("speed", "the default limits of a profile are enough")
-    if trip.median_s > timings.burst_s - timings.boot_watch_s:
+    if trip.median_s > TIMES.burst_s - TIMES.boot_watch_s:
         what = (
             f"an update command may reach a bootloader {trip.median_s * 1000:.0f} ms late, after "
         )
-        what += f"the {timings.burst_s * 1000:.0f} ms in which it announces itself"
+        what += f"the {TIMES.burst_s * 1000:.0f} ms in which it announces itself"
         yield _problem("speed", what, ("try another cable, port or adapter",))
     if found.packet_s is not None:
         times = found.packet_s / found.line_packet_s

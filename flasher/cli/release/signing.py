@@ -100,10 +100,10 @@ def _ask(question: str) -> str:
         ) from error
 
 
-def key_option(text: str, *, required: bool = True) -> Decorator:
+def key_option(text: str) -> Decorator:
     """Declare --key, which may be repeated."""
     return option(
-        "--key", "keys", multiple=True, required=required, metavar="KEY", panel="keys",
+        "--key", "keys", multiple=True, required=True, metavar="KEY", panel="keys",
         type=values.FilePath(), brief=True,
         help=f"{text}: a private key file, or hsm:ID?label=LABEL in a token; may be repeated",
     )  # fmt: skip
