@@ -86,6 +86,28 @@ def without_ids(content: Mapping[str, Any]) -> RunDetails:
     )
 
 
+def differing(
+    connection: Connection,
+    run_ids: Mapping[int, int],
+    contents: Mapping[int, Any],
+    missing: str,
+    compared: Callable[[RunDetails], RunDetails] = lambda details: details,
+) -> Iterator[Problem]:
+    """Compare what reports and pages read with what the stations signed. `run_ids`: ids in the
+    database by the run's number at the station; `compared`: the part of a run that has to be equal.
+    """
+    shown = chain.contents_of(connection, run_ids.values())
+    for number, run_id in run_ids.items():
+        found = shown.get(run_id)
+        if found is None or not is_whole(found):
+            what = missing
+        elif compared(without_ids(found)) != compared(without_ids(contents[number])):
+            what = "what reports and pages show differs from what the station signed"
+        else:
+            continue
+        yield Problem(text("run {run_id}", run_id=number), what)
+
+
 def _as_kept(details: RunDetails) -> RunDetails:
     """What stays of a retired run."""
     targets = tuple(replace(each, signature=None) for each in details.targets)
@@ -206,13 +228,5 @@ class ArchiveExaminer(AssembledExaminer):
             kept_run.c.run_number.in_(contents),
         )
         kept = {row.run_number: row.run_id for row in connection.execute(query)}
-        shown = chain.contents_of(connection, kept.values())
-        for number, run_id in kept.items():
-            found = shown.get(run_id)
-            if found is None or not is_whole(found):
-                what = "the database does not have the last run of its unit"
-            elif _as_kept(without_ids(found)) != _as_kept(without_ids(contents[number])):
-                what = "what reports and pages show differs from what the station signed"
-            else:
-                continue
-            yield Problem(text("run {run_id}", run_id=number), what)
+        missing = "the database does not have the last run of its unit"
+        yield from differing(connection, kept, contents, missing, _as_kept)

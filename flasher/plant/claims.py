@@ -20,7 +20,7 @@ from flasher.plant.central import Central
 from flasher.plant.forwarder import ENTER
 from flasher.station.records import chain, schema
 from flasher.station.records.branch import branches
-from flasher.station.records.database import Database
+from flasher.station.records.database import Database, records_id_of
 from flasher.station.records.errors import RecordError
 from flasher.station.records.model import (
     PLANT_CLAIM,
@@ -239,7 +239,7 @@ class PlantClaims:
 
     def _read(self) -> _Own:
         with self._records.reading() as local:
-            records = str(local.execute(select(schema.schema_info.c.records_id)).scalar_one())
+            records = records_id_of(local)
             takeover = chain.last_takeover(local, self._station)
             last = {each.takeover: each for each in branches(local, self._station)}
             is_restored = bool(chain.rows_without_run(local, self._station, [chain.RESTORED]))

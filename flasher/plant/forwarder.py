@@ -24,19 +24,18 @@ from typing import Any, Final
 from uuid import UUID
 
 from pydantic import TypeAdapter, ValidationError
-from sqlalchemy import Connection, func, select, text
+from sqlalchemy import Connection, text
 
 from flasher import __version__
 from flasher.files import part_of, read
 from flasher.plant.central import Central, ChainRefusedError, Refusal
 from flasher.plant.schema import OWN_PARTS, SHARED_PARTS
 from flasher.protocol.text import printable
-from flasher.station.records import chain, schema
-from flasher.station.records.database import Database, in_file_name
+from flasher.station.records import chain
+from flasher.station.records.database import Database, in_file_name, records_id_of
 from flasher.station.records.errors import RecordError
 from flasher.station.records.files import FileStore
 from flasher.station.records.model import StationClock, utc_text
-from flasher.station.records.schema import audit
 
 BATCH_ROWS: Final = 200
 BATCH_BYTES: Final = 4 * 1024 * 1024
@@ -196,7 +195,7 @@ class Forwarder:
     def has_new(self) -> bool:
         """True if the station has rows that were not sent."""
         with self._records.reading() as local:
-            query = _rows_after(self._station, self.state.sent).limit(1)
+            query = chain.rows_after(self._station, self.state.sent).limit(1)
             return local.execute(query).first() is not None
 
     def _enter(self) -> _Head:
@@ -208,7 +207,7 @@ class Forwarder:
     @cached_property
     def _records_id(self) -> str:
         with self._records.reading() as local:
-            return str(local.execute(select(schema.schema_info.c.records_id)).scalar_one())
+            return records_id_of(local)
 
     def _batch_after(self, head: _Head) -> _Batch:
         """Read the rows after the database's last one. Raises ChainRefusedError for a last row that
@@ -218,7 +217,8 @@ class Forwarder:
         with self._records.reading() as local:
             if head.number:
                 self._compare(local, head)
-            rows = local.execute(_rows_after(self._station, head.number)).mappings().all()
+            following = chain.rows_after(self._station, head.number).limit(BATCH_ROWS)
+            rows = local.execute(following).mappings().all()
             runs = {row["run_id"] for row in rows if row["event"] in _WITH_RUN}
             contents = chain.contents_of(local, runs)
         for row in rows:
@@ -350,23 +350,9 @@ def row_values(row: Mapping[Any, Any], station: UUID) -> dict[str, Any]:
     return named | {"station": station, "run_number": row["run_id"], "content": None}
 
 
-def _rows_after(station: str, number: int) -> Any:
-    station_id = select(schema.station.c.id).where(schema.station.c.name == station)
-    return (
-        select(audit)
-        .where(audit.c.station_id == station_id.scalar_subquery(), audit.c.number > number)
-        .order_by(audit.c.number)
-        .limit(BATCH_ROWS)
-    )
-
-
 def _rest(local: Connection, station: str, number: int) -> tuple[int, str]:
     """Number of the last row, and time of the first row after `number`."""
-    first = local.execute(_rows_after(station, number).limit(1)).mappings().one_or_none()
+    first = local.execute(chain.rows_after(station, number).limit(1)).mappings().one_or_none()
     if first is None:
         return number, ""
-    station_id = select(schema.station.c.id).where(schema.station.c.name == station)
-    last = select(func.max(audit.c.number)).where(
-        audit.c.station_id == station_id.scalar_subquery()
-    )
-    return int(local.execute(last).scalar_one()), str(first["at"])
+    return chain.last_number(local, station), str(first["at"])

@@ -33,8 +33,8 @@ from flasher.plant.schema import (
     plant_station,
 )
 from flasher.protocol.text import printable
-from flasher.station.records import schema
 from flasher.station.records.chain import GENESIS
+from flasher.station.records.database import records_id_of
 from flasher.station.records.errors import RecordError, RecordsDamagedError
 from flasher.station.records.model import DUPLICATES, FLASH, Problem, StepName
 from flasher.station.records.server import ServerLock
@@ -104,9 +104,7 @@ class Retirement:
         central.check_schema()
         central.check_owner("retire records")
         with central.reading() as connection:
-            self._plant = str(
-                connection.execute(select(schema.schema_info.c.records_id)).scalar_one()
-            )
+            self._plant = records_id_of(connection)
 
     def months(self, before: str) -> list[DueMonth]:
         """Months before `before` with what would be retired of them; nothing is changed."""

@@ -6,18 +6,17 @@ import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 from uuid import UUID
 
 from sqlalchemy import Connection, func, select
 
-from flasher.i18n import text
 from flasher.plant.archive import ArchivedChain
 from flasher.plant.archive_check import (
     ArchiveExaminer,
     AssembledExaminer,
     assembled,
-    without_ids,
+    differing,
 )
 from flasher.plant.retire import last_archived, recorded_chains
 from flasher.plant.schema import archive_file, chain_row, kept_run
@@ -27,7 +26,6 @@ from flasher.station.records import chain, schema
 from flasher.station.records.errors import RecordError
 from flasher.station.records.examination import ExaminedTrail, same_traces
 from flasher.station.records.model import Problem
-from flasher.station.records.queries import is_whole
 from flasher.station.records.rows import batches
 from flasher.station.records.signatures import fingerprint
 
@@ -137,11 +135,7 @@ class PlantExaminer(AssembledExaminer):
                 f"{len(unexamined)} files of retired months were not examined, nor the runs that"
                 " stayed of them: name their folder with --archive"
             )
-        if self._nameless:
-            self._remarks.append(
-                f"{self._nameless} PASS of devices that report no serial number: their traces do"
-                " not identify the unit"
-            )
+        self._remark_nameless()
         stations.sort(key=lambda each: each.station)
         return PlantExamination(
             tuple(problems), tuple(self._remarks), tuple(stations), self._runs, self._traces,
@@ -199,22 +193,9 @@ class PlantExaminer(AssembledExaminer):
         found = assembled(rows, shared_parts(connection, station, digests))
         central = {row["run_number"]: row["run_id"] for row in rows if row["content"] is not None}
         yield from self._assembled(found)
-        yield from self._projected(connection, found.contents, central)
-
-    def _projected(
-        self, connection: Connection, contents: Mapping[int, Any], central: Mapping[int, int]
-    ) -> Iterator[Problem]:
-        """Compare what reports and pages read with what the stations have signed."""
-        shown = chain.contents_of(connection, central.values())
-        for number, content in contents.items():
-            found = shown.get(central[number])
-            if found is None or not is_whole(found):
-                what = "reports and pages do not have it as a whole"
-            elif without_ids(found) != without_ids(content):
-                what = "what reports and pages show differs from what the station signed"
-            else:
-                continue
-            yield Problem(text("run {run_id}", run_id=number), what)
+        whole = {number: central[number] for number in found.contents}
+        missing = "reports and pages do not have it as a whole"
+        yield from differing(connection, whole, found.contents, missing)
 
 
 def _gaps(files: Mapping[str, Sequence[ArchivedChain]]) -> Iterator[Problem]:

@@ -62,7 +62,8 @@ def bring_in(
         with store.database.reading() as own:
             fork = _fork(own, other, store.station, branch.location.shown)
             key = chain.key_in_force(own, store.station, fork + 1)
-        rows = _rows_after(other, store.station, fork)
+        found = other.execute(chain.rows_after(store.station, fork)).mappings()
+        rows = [{name: each[name] for name in _ROW} for each in found]
         takeover = chain.last_takeover(other, store.station)
         if not rows:
             raise NotFoundError(
@@ -154,7 +155,7 @@ def _fork(own: Connection, other: Connection, station: str, where: str) -> int:
     for each in reversed(branches(own, station)):
         if chain.hash_at(other, station, each.last) == each.head:
             return each.here
-    low, high = 0, _last(other, station)
+    low, high = 0, chain.last_number(other, station)
     while low < high:  # rows are equal up to the fork, and none after it
         middle = (low + high + 1) // 2
         found = chain.hash_at(own, station, middle)
@@ -170,23 +171,6 @@ def _fork(own: Connection, other: Connection, station: str, where: str) -> int:
             code=ErrorCode.RECORDS,
         )
     return low
-
-
-def _last(connection: Connection, station: str) -> int:
-    query = select(func.max(schema.audit.c.number)).join(schema.station)
-    found = connection.execute(query.where(schema.station.c.name == station)).scalar_one()
-    return int(found or 0)
-
-
-def _rows_after(connection: Connection, station: str, number: int) -> list[dict[str, Any]]:
-    row = schema.audit.c
-    query = (
-        select(*(row[name] for name in _ROW))
-        .join(schema.station)
-        .where(schema.station.c.name == station, row.number > number)
-        .order_by(row.number)
-    )
-    return [dict(each) for each in connection.execute(query).mappings()]
 
 
 def _check(

@@ -15,7 +15,7 @@ from enum import StrEnum
 from functools import cache
 from typing import Any, Final
 
-from sqlalchemy import Connection, Row, Select, Table, bindparam, select
+from sqlalchemy import Connection, Row, Select, Table, bindparam, func, select
 
 from flasher.station.records import schema
 from flasher.station.records.heads import ChainHead
@@ -220,6 +220,20 @@ def rows_without_run(
     rows = connection.execute(_WITHOUT_RUN, {"events": list(events)})
     found = (row for row in rows if row.station_id == wanted)
     return sorted(found, key=lambda row: row.number)
+
+
+def rows_after(station_name: str, number: int) -> Select[Any]:
+    """Query of a station's audit rows after row `number`, in order."""
+    after = select(audit).where(_OF_STATION, audit.c.number > number).order_by(audit.c.number)
+    return after.params(station=station_name)
+
+
+def last_number(connection: Connection, station_name: str) -> int:
+    """Number of a station's last audit row; 0 for an empty chain."""
+    last = connection.execute(
+        select(func.max(audit.c.number)).where(_OF_STATION), {"station": station_name}
+    )
+    return int(last.scalar_one() or 0)
 
 
 def head_of(connection: Connection, run_id: int) -> ChainHead | None:

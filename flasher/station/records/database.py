@@ -420,6 +420,11 @@ def revision_of(connection: Connection) -> str:
     return "" if version is None else str(version)
 
 
+def records_id_of(connection: Connection) -> str:
+    """Id of these records and of every copy of them."""
+    return str(connection.execute(select(schema_info.c.records_id)).scalar_one())
+
+
 def _create(database: Database, now: datetime) -> None:
     """Create all tables and triggers in one transaction, unless another process just did."""
     with database.writing() as connection:

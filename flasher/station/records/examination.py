@@ -16,7 +16,7 @@ from flasher.i18n import text
 from flasher.protocol.text import printable
 from flasher.station.records import chain, schema
 from flasher.station.records.chain import NAMED, OWN, contents_of
-from flasher.station.records.database import Database
+from flasher.station.records.database import Database, records_id_of
 from flasher.station.records.errors import RecordError
 from flasher.station.records.examined import Examined, ExaminedChain
 from flasher.station.records.files import FileStore
@@ -140,7 +140,7 @@ class Examiner:
     def examine(self, now: datetime) -> Examination:
         """Examine all records, or those after `since`. Raises RecordError."""
         with self._database.reading() as connection:
-            records_id = _records_id(connection)
+            records_id = records_id_of(connection)
             names = list(connection.execute(select(schema.station.c.name)).scalars())
         # Heads are read before the records, to which a station may add rows meanwhile.
         kept = list(self._reach(records_id, names))
@@ -154,11 +154,7 @@ class Examiner:
             problems = tuple(self._problems(connection, records_id, kept))
             if not problems:
                 self.examined = self._examined_part(connection, records_id, now)
-        if self._nameless:
-            self._remarks.append(
-                f"{self._nameless} PASS of devices that report no serial number: their traces do"
-                " not identify the unit"
-            )
+        self._remark_nameless()
         return Examination(
             problems,
             tuple(self._remarks),
@@ -168,6 +164,13 @@ class Examiner:
             tuple(self._unreached),
             None if self._since is None else self._since.at,
         )
+
+    def _remark_nameless(self) -> None:
+        if self._nameless:
+            self._remarks.append(
+                f"{self._nameless} PASS of devices that report no serial number: their traces do"
+                " not identify the unit"
+            )
 
     def _problems(
         self,
@@ -326,13 +329,7 @@ class Examiner:
         others = [name for each in kept for name in each.lasts]
         for name in dict.fromkeys([*names, *others]):
             trail = _continued_trail(name, self._since)
-            query = (
-                select(schema.audit)
-                .join_from(schema.audit, schema.station)
-                .where(schema.station.c.name == name, schema.audit.c.number > trail.begin)
-                .order_by(schema.audit.c.number)
-                .execution_options(yield_per=1000)
-            )
+            query = chain.rows_after(name, trail.begin).execution_options(yield_per=1000)
             self._trails_found.append(trail)
             with connection.execute(query) as rows:
                 yield from self._chain(trail, rows.mappings(), records_id)
@@ -383,7 +380,7 @@ class Examiner:
     def examine_run(self, run_id: RunId) -> RunExamination:
         """Examine one run and its audit rows without reading all records. Raises RecordError."""
         with self._database.reading() as connection:
-            records_id = _records_id(connection)
+            records_id = records_id_of(connection)
             names = connection.execute(
                 select(schema.station.c.name)
                 .join_from(schema.audit, schema.station)
@@ -550,13 +547,9 @@ class Examiner:
             yield Problem(where, f"its trace contradicts it: {what}", (run.run_id,))
 
 
-def _records_id(connection: Connection) -> str:
-    return str(connection.execute(select(schema.schema_info.c.records_id)).scalar_one())
-
-
 def _is_as_examined(connection: Connection, since: Examined) -> bool:
     """True if the examined rows still exist, by their number and the last hash of each chain."""
-    if _records_id(connection) != since.records:
+    if records_id_of(connection) != since.records:
         return False
     audit, run = schema.audit.c, schema.run.c
     for name, each in since.chains.items():

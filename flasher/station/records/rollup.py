@@ -29,7 +29,7 @@ from sqlalchemy.sql.expression import ColumnElement
 from flasher.protocol.text import printable
 from flasher.station.records import schema
 from flasher.station.records.chain import ENDINGS
-from flasher.station.records.database import Database
+from flasher.station.records.database import Database, records_id_of
 from flasher.station.records.errors import RecordError
 from flasher.station.records.filters import JUDGED, begun_in, counting, named_in
 from flasher.station.records.model import (
@@ -349,10 +349,9 @@ def _save_state(sums: sqlite3.Connection, connection: Connection, run: int, mark
     audit = schema.audit.c
     newest = select(audit.id, audit.hash).order_by(audit.id.desc()).limit(1)
     row = connection.execute(newest).one()
-    records = connection.execute(select(schema.schema_info.c.records_id)).scalar_one()
     state = {
-        "layout": _LAYOUT, "records": records, "run": run, "audit": row.id, "hash": row.hash,
-        "first": _first(connection), "marks": asdict(marks),
+        "layout": _LAYOUT, "records": records_id_of(connection), "run": run, "audit": row.id,
+        "hash": row.hash, "first": _first(connection), "marks": asdict(marks),
     }  # fmt: skip
     sums.execute("DELETE FROM state")
     sums.execute("INSERT INTO state VALUES (?)", (json.dumps(state),))
@@ -372,10 +371,9 @@ def _added(sums: sqlite3.Connection, connection: Connection) -> _Added | None:
     found = json.loads(row[0])
     if found["layout"] != _LAYOUT or found["first"].items() - _first(connection).items():
         return None
-    audit, info = schema.audit.c, schema.schema_info.c
+    audit = schema.audit.c
     is_same = select(audit.id).where(audit.id == found["audit"], audit.hash == found["hash"])
-    records = select(info.records_id).where(info.records_id == found["records"])
-    if any(connection.execute(query).first() is None for query in (is_same, records)):
+    if connection.execute(is_same).first() is None or found["records"] != records_id_of(connection):
         return None
     marks = _Marks(**found["marks"])
     late = select(audit.id, audit.run_id).where(

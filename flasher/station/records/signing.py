@@ -9,12 +9,10 @@ from functools import cached_property
 from pathlib import Path
 from threading import Lock
 
-from sqlalchemy import select
-
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
 from flasher.station.records import chain
-from flasher.station.records.database import Database
+from flasher.station.records.database import Database, records_id_of
 from flasher.station.records.errors import (
     KeyMissingError,
     NotFoundError,
@@ -24,7 +22,6 @@ from flasher.station.records.errors import (
 from flasher.station.records.heads import ChainHead, HeadsFile
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.places import Copying, Place, lasts
-from flasher.station.records.schema import schema_info
 from flasher.station.records.signatures import SigningKey, fingerprint
 
 
@@ -50,9 +47,8 @@ class Signer:
 
     @cached_property
     def records_id(self) -> str:
-        """Id of these records and every copy of them."""
         with self._database.reading() as connection:
-            return str(connection.execute(select(schema_info.c.records_id)).scalar_one())
+            return records_id_of(connection)
 
     @property
     def key_file(self) -> Path:
