@@ -40,7 +40,7 @@ _TEXTS: Final[dict[str, dict[str, str]]] = {
     },
     "DeviceLeft": {
         "untouched": "this run erased nothing: the device is as it was before",
-        "perhaps_erased": "it received the command to erase its application and did not answer: "
+        "perhaps_erased": "the command to erase its application was sent, and not answered: "
         "flash it again, or check after a power cycle what it runs",
         "no_application": "its application is erased, half written or not accepted: it stays in "
         "its bootloader until an image is flashed completely",
@@ -102,12 +102,14 @@ _TEXTS: Final[dict[str, dict[str, str]]] = {
         "confirmed_by_version": "final answer lost, new application answers",
         "nobody_acknowledges": "no node acknowledges on the bus",
         "no_boot_version": "no boot version after the reset",
+        "reset_ignored": "no boot version after a reset that the application confirmed",
         "no_request": "no request transfer after the update command",
         "update_not_taken": "the bootloader does not accept the update command",
         "wrong_device": "another kind of device",
         "two_devices": "two devices on one CAN id",
         "packet_refused": "a packet was refused again and again",
         "packet_unanswered": "a packet was never answered",
+        "packet_answered_otherwise": "a packet has answers, but no ACK of its number",
         "packet_damaged": "damaged frames in the transfer",
         "device_restarted": "the device restarted in the middle",
         "second_tool": "two tools speak on the bus",
@@ -182,6 +184,11 @@ _EXPLANATIONS: Final[dict[str, Explanation]] = {
         "--in-session reaches that. One that announces itself at power-up only is reached by "
         "flasher rescue and a power cycle.",
     ),
+    "reset_ignored": Explanation(
+        "it ignores the reset in its state, its profile needs another reset_command, its "
+        "announcement was lost, or its bootloader announces itself only at power-up",
+        f"{_AGAIN} If it does not help, flasher rescue and a power cycle reach its bootloader.",
+    ),
     "no_request": Explanation(
         "erasing takes longer than the tool waited, the device refuses this size or target, or it "
         "hangs",
@@ -208,6 +215,11 @@ _EXPLANATIONS: Final[dict[str, Explanation]] = {
     "packet_unanswered": Explanation(
         "the device lost power or contact, hangs, or its answers do not get through",
         f"Check supply and wiring, power-cycle the device. {_AGAIN} {_RESCUE}",
+    ),
+    "packet_answered_otherwise": Explanation(
+        "the bootloader numbers packets in another way than table 9 (two bytes, the low one "
+        "first) or answers them with another message, or an application runs again",
+        f"Report it to the maker of the bootloader. {_AGAIN} {_RESCUE}",
     ),
     "packet_damaged": Explanation(
         "the line is disturbed, an adapter loses frames, or two senders share one id",

@@ -119,6 +119,10 @@ class Outcome:
     wrote to the device then is not known, and the device cannot be asked."""
     frame_gap_s: float = 0.0
     """Silence between the frames of a message, as chosen by the options."""
+    was_answered_otherwise: bool = False
+    """The packet that failed has answers, but none by table 9; `detail` names one."""
+    application_runs: bool = False
+    """The device's application sent something shortly before the end."""
 
     @property
     def ok(self) -> bool:
@@ -152,8 +156,12 @@ class Outcome:
         if self.ok or self.nothing_to_do:
             return None
         explained = _EXPLANATIONS.get(self.ending)
-        if explained is None:
+        if self.was_answered_otherwise:
+            explained = _ANSWERED_OTHERWISE
+        elif explained is None:
             explained = _late(self.phase, self.device_left)
+        elif self.application_runs and self.ending in _APPLICATION_RUNS:
+            explained = _APPLICATION_RUNS[self.ending]
         elif self.ending is Ending.NO_BOOT_VERSION and self.sent_into_silence:
             explained = _NO_SESSION_EITHER
         elif self.ending is Ending.TWO_DEVICES and self.device_left.needs_rescue:
@@ -381,6 +389,31 @@ _NO_SESSION_EITHER: Final = _EXPLANATIONS[Ending.NO_BOOT_VERSION]._replace(
     "by flasher rescue and a power cycle."
 )
 """Explanation for a device that was silent to the update command as well (R26)."""
+_ANSWERED_OTHERWISE: Final = _Explanation(
+    TransferError,
+    "its bootloader numbers packets in another way than table 9 (two bytes, the low one first) or "
+    "answers them with another message, or an application runs again",
+    "Report it to the maker of the bootloader, with the bundle. {again}",
+    code=ErrorCode.PACKET_FAILED,
+)
+_APPLICATION_RUNS: Final = {
+    Ending.NO_BOOT_VERSION: _Explanation(
+        NoAnswerError,
+        "its application runs: it ignores the reset in its state, its profile needs another "
+        "reset_command, its announcement was lost, or its bootloader announces itself only at "
+        "power-up",
+        "{again} If it does not help, flasher rescue and a power cycle reach its bootloader.",
+        code=ErrorCode.NO_BOOT_VERSION,
+    ),
+    Ending.NO_ANNOUNCEMENT: _Explanation(
+        NoAnswerError,
+        "its application runs: it was not switched off and on, or its bootloader does not announce "
+        "itself at power-up",
+        "Upgrade it with flasher flash, which resets the application itself.",
+        code=ErrorCode.NO_ANNOUNCEMENT,
+    ),
+}
+"""Explanations for a device whose application sent something shortly before."""
 
 
 _TWO_PERHAPS_ERASED: Final = _Explanation(

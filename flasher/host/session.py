@@ -337,7 +337,7 @@ class UpgradeSession(Runner[Result]):
         if frame[0] == self._plan.target.answer_id:
             return False
         if frame[0] in self._application_ids and frame.is_payload:
-            self._upgrade.in_session = False  # a bootloader sends only to the tool
+            self._upgrade.note_application()
         foreign = self._guard.see(frame, self.now)
         for event in self._guard.take_events():
             self.emit(event)

@@ -26,6 +26,7 @@ from flasher.host.options import (
 from flasher.host.outcome import DeviceLeft, Outcome, Statistics, describe_progress
 from flasher.host.runner import Runner, Signal, Stage, StageInput
 from flasher.host.table import TABLE, TIMERS, Ending, Reason, UpgradeEvent, UpgradeState
+from flasher.i18n import text
 from flasher.image.plan import Plan
 from flasher.protocol import catalogue
 from flasher.protocol.engine import DROP_MARGIN
@@ -74,6 +75,9 @@ _PHASES: Final = {
 """Phase that each state reports; other states keep the phase."""
 _FROM_THE_UPDATE: Final = frozenset({Reason.RESTARTED, Reason.REQUEST_LATE, Reason.BOOT_SILENT})
 """Reasons for an attempt that begins with the update command, not with a reset."""
+_APPLICATION_S: Final = 10.0
+"""Time after which a message of an application no longer shows that it runs: it was asked before
+the reset, whose boot version is then awaited."""
 _SILENT: Final = frozenset({Ending.NO_BOOT_VERSION, Ending.NO_ANNOUNCEMENT})
 _DEVICE_LEFT: Final = {
     Ending.COMPLETED: DeviceLeft.NEW,
@@ -106,6 +110,8 @@ class _Attempt:
 
     feedback_came: bool = False
     """The reset was answered, so an application runs."""
+    application_at: float = -inf
+    """Time of the last message of the device's application."""
     boot: BootVersion | None = None
     """First boot version of the attempt."""
     was_reset_again: bool = False
@@ -195,8 +201,9 @@ class UpgradeStage:
         """Ending of an earlier attempt if it had been the last one."""
         self._failed_packet: int | None = None
         """Packet at which an earlier attempt failed."""
-        self._nak_next_seen = False
-        """A repeated packet n was answered by NAK n+1, which was not accepted as ACK."""
+        self._other_answer = ""
+        """Describes an answer to a repeated packet that is none by table 9, since the last right
+        one."""
         self._second_tool = ""
         """Description of a second tool's frame."""
 
@@ -337,6 +344,11 @@ class UpgradeStage:
                 self._take(came)
         return self._outcome
 
+    def note_application(self) -> None:
+        """Record a message of the device's application: a bootloader sends only to the tool."""
+        self.in_session = False
+        self._at.application_at = self._run.now
+
     def _take(self, came: StageInput) -> None:
         if self._ending is not None:
             if came is Signal.LEFT:
@@ -371,6 +383,11 @@ class UpgradeStage:
         event = _EVENTS.get(type(row), UpgradeEvent.UNEXPECTED)
         if event is UpgradeEvent.FEEDBACK:
             self._at.feedback_came, self.in_session = True, False
+            if not self._update_was_sent:
+                self.note_application()
+            elif self.state is UpgradeState.TRANSFERRING and self._at.tries > 1:
+                feedback = text("the device answered {answer}", answer="general feedback")
+                self._other_answer = self._other_answer or feedback
         elif event is UpgradeEvent.NAK:
             self._naks += 1
         self._dispatch(event, row)
@@ -762,7 +779,7 @@ class UpgradeStage:
 
     def _next_packet(self, number: int) -> None:
         at = self._at
-        at.packet, at.tries = number, 0
+        at.packet, at.tries, self._other_answer = number, 0, ""
         at.copies_unanswered, at.accepted = 0, False
         self._send_packet()
 
@@ -773,10 +790,19 @@ class UpgradeStage:
             # Some bootloaders answer a repeated n with NAK n+1: "I want n+1".
             is_next = answer.number == at.packet + 1 and not accepts and at.tries > 1
             if not (is_next and self._options.nak_next_is_ack):
-                self._nak_next_seen = self._nak_next_seen or is_next
+                if is_next:
+                    self._other_answer = (
+                        "it answers NAK n+1 to a repeated n; --nak-next-is-ack takes that for an "
+                        "ACK"
+                    )
+                elif at.tries > 1:
+                    shown = f"{'ACK' if accepts else 'NAK'} {answer.number}"
+                    self._other_answer = text("the device answered {answer}", answer=shown)
                 self._report(answer, "ACK or NAK for another packet")
                 return
             accepts = True
+        if answer.number == at.packet:
+            self._other_answer = ""
         is_sending = self._tx.due_at < inf
         first_copy_is_out = at.tries > 1 or not is_sending
         is_stale = answer.number < at.packet or (
@@ -1001,8 +1027,8 @@ class UpgradeStage:
         """End the upgrade as soon as a partly sent message is complete; device text is escaped."""
         if isinstance(row, BootVersion):
             detail = f"boot version {printable(row.name)!r} {printable(row.version)!r}"
-        elif ending is Ending.PACKET_FAILED and self._nak_next_seen:
-            detail = "it answers NAK n+1 to a repeated n; --nak-next-is-ack takes that for an ACK"
+        elif self._was_answered_otherwise(ending):
+            detail = self._other_answer
         elif ending is Ending.PACKET_FAILED and self._phase is not Phase.TRANSFER:
             detail = "and no boot version came after it"
         self._ending = (ending, detail)
@@ -1011,6 +1037,11 @@ class UpgradeStage:
         self._tx.send_without_gaps()
         if self._tx.idle:
             self._finish()
+
+    def _was_answered_otherwise(self, ending: Ending) -> bool:
+        """True if the packet that failed has answers, but none by table 9."""
+        is_late = ending is Ending.OUT_OF_TIME and self._phase is Phase.TRANSFER
+        return bool(self._other_answer) and (is_late or ending is Ending.PACKET_FAILED)
 
     def _finish(self) -> None:
         if self._ending is None:
@@ -1044,6 +1075,8 @@ class UpgradeStage:
             sent_into_silence=self._silence_was_answered,
             unobserved_s=self._at.unobserved_s,
             frame_gap_s=self._options.frame_gap_s,
+            was_answered_otherwise=self._was_answered_otherwise(ending),
+            application_runs=self._run.now - self._at.application_at <= _APPLICATION_S,
         )
 
 

@@ -137,6 +137,10 @@ class ObservedUpgrade:
     errors: int = 0
     errors_now: int = 0
     """Error frames since the last progress."""
+    answered_otherwise: int = 0
+    """General feedback, and ACKs with a number that was not sent, since the last progress."""
+    other_answer: str = ""
+    """The latest of these."""
     extra_acks: int = 0
     """Second ACKs for packets that were sent once."""
     image_versions: set[str] = field(default_factory=set)
@@ -358,6 +362,7 @@ class ObservedUpgrade:
                     self._enter(Phase.BOOT, timed.end_s)
                 elif self.phase in (Phase.UPDATE, Phase.TRANSFER):
                     self.feedbacks_after_update += 1
+                    self._answered_otherwise("general feedback")
             case Command.BOOT_VERSION:
                 self._boot_version(timed, values)
             case Command.REQUEST_TRANSFER:
@@ -416,6 +421,7 @@ class ObservedUpgrade:
         self.link.answer(number, timed, is_ack=True)
         packet = self._by_number.get(number)
         if packet is None:
+            self._answered_otherwise(f"ACK {number}")
             return
         if packet.answered_at_s is not None:
             self.extra_acks += packet.is_clean
@@ -423,6 +429,10 @@ class ObservedUpgrade:
         packet.answered_at_s = timed.end_s
         packet.answer_s = max(0.0, timed.end_s - self._left_s[number])
         self._progress()
+
+    def _answered_otherwise(self, how: str) -> None:
+        self.answered_otherwise += 1
+        self.other_answer = how
 
     # -- phases, attempts and silence --------------------------------------------------------------
 
@@ -440,7 +450,7 @@ class ObservedUpgrade:
 
     def _progress(self) -> None:
         """Forget trouble before a success: it does not explain a later failure."""
-        self.damage_now = self.errors_now = 0
+        self.damage_now = self.errors_now = self.answered_otherwise = 0
 
     def _next_attempt(self, at_s: float) -> None:
         """Reset the facts of a single attempt, because the tool starts over."""

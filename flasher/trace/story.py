@@ -25,6 +25,8 @@ class Cause(Enum):
     # It did not begin.
     NOBODY_ACKNOWLEDGES = "nobody_acknowledges"
     NO_BOOT_VERSION = "no_boot_version"
+    RESET_IGNORED = "reset_ignored"
+    """The application confirmed the reset, and no boot version followed."""
     NO_REQUEST = "no_request"
     UPDATE_NOT_TAKEN = "update_not_taken"
     WRONG_DEVICE = "wrong_device"
@@ -33,6 +35,7 @@ class Cause(Enum):
     # It broke off.
     PACKET_REFUSED = "packet_refused"
     PACKET_UNANSWERED = "packet_unanswered"
+    PACKET_ANSWERED_OTHERWISE = "packet_answered_otherwise"
     PACKET_DAMAGED = "packet_damaged"
     DEVICE_RESTARTED = "device_restarted"
     SECOND_TOOL = "second_tool"

@@ -24,7 +24,9 @@ _RESETS: Final = 3
 _ERRORS: Final = 3
 """Number of error frames since the last progress that are the reason, not a coincidence."""
 _EXTRA_ACKS: Final = 3
-_NO_RETURN: Final = frozenset({Cause.NO_BOOT_VERSION, Cause.NO_REQUEST, Cause.UPDATE_NOT_TAKEN})
+_NO_RETURN: Final = frozenset(
+    {Cause.NO_BOOT_VERSION, Cause.RESET_IGNORED, Cause.NO_REQUEST, Cause.UPDATE_NOT_TAKEN}
+)
 
 
 class _Found(NamedTuple):
@@ -161,7 +163,7 @@ def _before_update(upgrade: ObservedUpgrade, until_s: float) -> _Found:
         return _stopped(text, until_s - upgrade.tool_at_s)
     if upgrade.feedbacks:
         text = f"The application of the {node} confirmed the reset, and no boot version followed."
-        return _Found(Cause.NO_BOOT_VERSION, text + _short(until_s - upgrade.last_at_s))
+        return _Found(Cause.RESET_IGNORED, text + _short(until_s - upgrade.last_at_s))
     text = f"The reset was sent {times(upgrade.resets)}, and the {node} did not answer."
     if upgrade.resets >= _RESETS or until_s - upgrade.begin_s >= _SILENT_S:
         return _Found(Cause.NO_BOOT_VERSION, text)
@@ -203,8 +205,10 @@ def _in_transfer(upgrade: ObservedUpgrade, silent_s: float) -> _Found:
     if packet.naks and packet.tries == 1:
         return _stopped(f"{which} was refused once, and was not sent again.", silent_s)
     if packet.tries > 1 or silent_s >= _ACK_WAIT_S:
-        answers = "the application answers" if upgrade.feedbacks_after_update else "no ACK came"
-        return _Found(Cause.PACKET_UNANSWERED, f"{sent}, and {answers}.")
+        if upgrade.answered_otherwise > 1 and upgrade.answered_otherwise * 2 >= packet.tries:
+            text = f"{sent}, and was answered by {upgrade.other_answer}."
+            return _Found(Cause.PACKET_ANSWERED_OTHERWISE, text)
+        return _Found(Cause.PACKET_UNANSWERED, f"{sent}, and no ACK came.")
     return _Found(Cause.RECORDING_ENDS, f"{sent}, its answer is not in the trace any more.")
 
 

@@ -187,7 +187,7 @@ STAGES = [
     (Phase.IDENTIFY, "this run erased nothing", False),
     (Phase.RESET, "this run erased nothing", False),
     (Phase.BOOT, "this run erased nothing", False),
-    (Phase.UPDATE, "it received the command to erase its application", True),
+    (Phase.UPDATE, "the command to erase its application was sent", True),
     (Phase.TRANSFER, "its application is erased, half written or not accepted", True),
     (Phase.END, "it acknowledged every byte of the image", True),
 ]

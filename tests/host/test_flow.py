@@ -7,7 +7,7 @@ from itertools import pairwise
 import pytest
 
 from flasher import events
-from flasher.errors import ExitCode
+from flasher.errors import ErrorCode, ExitCode
 from flasher.events import Phase
 from flasher.host.options import UpgradeOptions, default_timeout_s
 from flasher.host.outcome import DeviceLeft
@@ -130,7 +130,19 @@ def test_no_boot_version_ends_with_no_answer_and_an_untouched_device() -> None:
     assert error is not None
     assert error.exit_code == ExitCode.NO_ANSWER
     assert "waiting for the boot version" in str(error)
+    assert "no power" in error.cause
     assert bench.now - 100.0 < 21.0
+
+
+def test_an_application_that_confirms_the_reset_and_goes_on_has_power_and_contact() -> None:
+    bench = Bench()
+    bench.to_boot()
+    bench.wait(20.0)
+    error = bench.outcome.error()
+    assert error is not None
+    assert error.code is ErrorCode.NO_BOOT_VERSION
+    assert "its application runs" in error.cause
+    assert "no power" not in error.cause
 
 
 @each("late_s, answered", [(-0.001, True), (0.001, False)])

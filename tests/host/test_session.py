@@ -506,6 +506,24 @@ def test_a_unit_that_is_exchanged_during_the_upgrade_is_exit_code_6() -> None:
     assert session.result.outcome.device_left is DeviceLeft.UNKNOWN
 
 
+@each("sends_until_s, runs", [(60.0, True), (40.0, False)])
+def test_an_application_that_sends_when_a_power_cycle_is_awaited_was_not_switched_off(
+    *, sends_until_s: float, runs: bool
+) -> None:
+    session = UpgradeSession(planned(), UpgradeOptions(at_power_up=True))
+    now = 0.0
+    while not session.done:
+        session.tick(now)
+        if now < sends_until_s:
+            session.receive(Frame(BMS.broadcast_id, b"\x55"), now)
+        now += 1.0
+    error = session.result.error()
+    assert error is not None
+    assert error.code is ErrorCode.NO_ANNOUNCEMENT
+    assert ("its application runs" in error.cause) is runs
+    assert ("flasher flash" in error.remedy) is runs
+
+
 @each("version, verdict", [(NEW, Verdict.INTERRUPTED), ("V1r0r0_20200101", Verdict.VERSION_OTHER)])
 def test_a_version_check_that_is_cancelled_after_an_answer_asks_no_more(
     version: str, verdict: Verdict

@@ -483,3 +483,41 @@ def test_no_message_is_ever_interleaved_with_another() -> None:
     assert bench.expect(Packet).number == 2
     bench.on_frame = None
     bench.expect(UpdateCommand)
+
+
+@each(
+    "answer, what",
+    [
+        (Ack(0x0200), "the device answered ACK 512"),
+        (Nak(7), "the device answered NAK 7"),
+        (GeneralFeedbackMessage(), "the device answered general feedback"),
+    ],
+)
+@each("timeout_s", [None, 2.0])
+def test_a_device_that_answers_a_packet_otherwise_has_power_and_contact(
+    answer: UpgradeMessage, what: str, timeout_s: float | None
+) -> None:
+    bench = Bench(options=UpgradeOptions(attempts=1, timeout_s=timeout_s))
+    bench.to_packet(2)
+    while not bench.engine.done:
+        bench.say(answer)
+        bench.wait(0.5)
+    error = bench.outcome.error()
+    assert error is not None
+    assert what in error.what
+    assert "power" not in error.cause
+    assert "numbers packets in another way" in error.cause
+    assert error.exit_code == ExitCode.TRANSFER
+
+
+@each("answer", [Ack(0x0200), GeneralFeedbackMessage()])
+def test_one_odd_answer_before_the_device_falls_silent_explains_nothing(
+    answer: UpgradeMessage,
+) -> None:
+    bench = Bench(options=UpgradeOptions(attempts=1))
+    bench.to_packet(2)
+    bench.say(answer)
+    bench.wait(60.0)
+    error = bench.outcome.error()
+    assert error is not None
+    assert "lost power" in error.cause

@@ -53,6 +53,13 @@ def unanswered(tape: Tape, times: int) -> Tape:
     return tape
 
 
+def misanswered(tape: Tape, times: int, answer: Callable[[Tape], object]) -> Tape:
+    for _ in range(times):
+        answer(tape.packet(7).wait(0.01))
+        tape.wait(0.5)
+    return tape
+
+
 def asked(tape: Tape, times: int) -> Tape:
     for _ in range(times):
         tape.wait(0.2).tool(0x1540, b"", READ)
@@ -118,7 +125,7 @@ CAUSES: list[tuple[str, Callable[[Tape], object], Cause, Phase | None, int | Non
     ),
     ("resets", lambda t: t.version(OLD).reset(5), Cause.NO_BOOT_VERSION, Phase.RESET, None),
     ("dead bus", lambda t: t.reset().error(9), Cause.NOBODY_ACKNOWLEDGES, Phase.RESET, None),
-    ("only feedback", lambda t: t.reset().feedback(), Cause.NO_BOOT_VERSION, Phase.BOOT, None),
+    ("only feedback", lambda t: t.reset().feedback(), Cause.RESET_IGNORED, Phase.BOOT, None),
     ("no request", lambda t: t.to_boot().update(), Cause.NO_REQUEST, Phase.UPDATE, None),
     (
         "announces on",
@@ -157,6 +164,27 @@ CAUSES: list[tuple[str, Callable[[Tape], object], Cause, Phase | None, int | Non
         4,
     ),
     ("NAKs", lambda t: refused(t.to_packet(7), 5), Cause.PACKET_REFUSED, Phase.TRANSFER, 7),
+    (
+        "ACKs of another byte order",
+        lambda t: misanswered(t.to_packet(7), 5, lambda tape: tape.ack(7 << 8)),
+        Cause.PACKET_ANSWERED_OTHERWISE,
+        Phase.TRANSFER,
+        7,
+    ),
+    (
+        "general feedback in the place of ACK",
+        lambda t: misanswered(t.to_packet(7), 5, lambda tape: tape.feedback()),
+        Cause.PACKET_ANSWERED_OTHERWISE,
+        Phase.TRANSFER,
+        7,
+    ),
+    (
+        "dead after a packet, after which it confirmed the one before",
+        lambda t: unanswered(t.to_packet(6).packet(6).ack(6).packet(7).feedback(), 5),
+        Cause.PACKET_UNANSWERED,
+        Phase.TRANSFER,
+        7,
+    ),
     ("no ACK", lambda t: unanswered(t.to_packet(7), 5), Cause.PACKET_UNANSWERED, Phase.TRANSFER, 7),
     (
         "damage",

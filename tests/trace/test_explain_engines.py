@@ -44,7 +44,7 @@ class Tapped(Traffic):
         (
             DeviceScript(versions_lost=frozenset({1, 2, 3, 4})),
             Ending.NO_BOOT_VERSION,
-            Cause.NO_BOOT_VERSION,
+            Cause.RESET_IGNORED,
         ),
         (DeviceScript(wrong_name=True), Ending.WRONG_DEVICE, Cause.WRONG_DEVICE),
         (DeviceScript(no_request=True), Ending.NO_REQUEST, Cause.NO_REQUEST),
