@@ -180,6 +180,11 @@ class Bench:
         self.wait(self.limit("window_s") / 2)
         self.forget()
 
+    def reset_to_window(self) -> None:
+        """Reset the device and wait for its window."""
+        self.reset_to_bootloader()
+        self.wait_for_window()
+
     @property
     def window_edge_s(self) -> float:
         """Margin around the window's end within which early and late cannot be told apart."""

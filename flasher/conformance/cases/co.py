@@ -147,8 +147,7 @@ def two_upgrades(bench: Bench) -> None:
     total = packet_count(len(image))
     for other in bench.encoder.others():
         with bench.step(f"beside the {other.target.upper()}"):
-            bench.reset_to_bootloader()
-            bench.wait_for_window()
+            bench.reset_to_window()
             _send_interleaved(bench, bench.encoder.update(len(image)), other.update(len(image)))
             bench.expect(Reply.REQUEST, ignoring=(Reply.BOOT_VERSION,))
             bench.send(other.answer(REQUEST, bytes(2)))

@@ -109,8 +109,7 @@ class Probe(PacketTransfer):
         """
         bench = self.bench
         if reset:
-            bench.reset_to_bootloader()
-            bench.wait_for_window()
+            bench.reset_to_window()
         reply = bench.await_request(bench.send(frames))
         taken = reply is not None and reply.kind is Reply.REQUEST
         bench.check(complies(wanted, taken), f"update command {wanted}", reply or "no answer")

@@ -328,15 +328,13 @@ def _cut_erase(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
     """Cut the power at several shares of the measured erase time."""
     _restore_old_image(bench, upgrade)
     upgrade.end_was_sent = upgrade.runs = False
-    bench.reset_to_bootloader()
-    bench.wait_for_window()
+    bench.reset_to_window()
     reply = bench.update(len(upgrade.new))
     erase_s = reply.at - bench.tester.left_at
     for share in _ERASE_SHARES:
         with bench.step(f"at {share:.0%} of the time until request transfer"):
             _restore_old_image(bench, upgrade)
-            bench.reset_to_bootloader()
-            bench.wait_for_window()
+            bench.reset_to_window()
             bench.send(bench.encoder.update(len(upgrade.new)))
             bench.wait(share * erase_s)
             bench.power_cycle(_OFF_S)
@@ -357,8 +355,7 @@ def _cut_operations(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
                 if not upgrade.was_requested:
                     _restore_old_image(bench, upgrade)
                 if upgrade.runs:
-                    bench.reset_to_bootloader()
-                    bench.wait_for_window()
+                    bench.reset_to_window()
                 upgrade.end_was_sent = False
                 bench.subject.cut_in_operation(operation, share, _OFF_S)
                 version = _upgrade_until_cut(bench, upgrade)
@@ -479,8 +476,7 @@ def _cut_before(bench: Bench, upgrade: _InterruptedUpgrade, operation: int) -> b
     whether it was cut; otherwise the new application starts.
     """
     with bench.step(f"before flash operation {operation + 1}"):
-        bench.reset_to_bootloader()
-        bench.wait_for_window()
+        bench.reset_to_window()
         upgrade.end_was_sent = False
         bench.subject.cut_in_operation(operation, _SHARES[0], _OFF_S)
         version = _upgrade_until_cut(bench, upgrade)
@@ -566,8 +562,7 @@ def _fail(bench: Bench, faults: FlashFaults, fault: FlashFault) -> None:
 
 def _attempt(bench: Bench, faults: FlashFaults, image: bytes) -> bool:
     """Upgrade the running application; True when the device reported success after the fault."""
-    bench.reset_to_bootloader()
-    bench.wait_for_window()
+    bench.reset_to_window()
     sent = bench.send(bench.encoder.update(len(image)))
     reply = bench.host.request_or_version(sent.left_at, bench.limit("erase_s"))
     if reply is None or reply.kind is not Reply.REQUEST or not bench.host.transfer(image).ok:

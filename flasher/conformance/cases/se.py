@@ -162,8 +162,7 @@ def noise(bench: Bench) -> None:
         bench.collect(bench.waits.burst_s)
         bench.check_image(image)
     with bench.step("while it erases"):
-        bench.reset_to_bootloader()
-        bench.wait_for_window()  # one that is deaf in its burst would not erase
+        bench.reset_to_window()  # one that is deaf in its burst would not erase
         bench.send(bench.encoder.update(len(image)))
         _send_noise(bench)
         bench.wait_for(Reply.REQUEST)

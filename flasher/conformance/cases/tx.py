@@ -84,8 +84,7 @@ def check_out_of_turn(bench: Bench, frames: Sequence[RawFrame]) -> None:
     """Send a packet or end of transfer to the announcing bootloader and check that no ACK, complete
     or request transfer follows.
     """
-    bench.reset_to_bootloader()
-    bench.wait_for_window()
+    bench.reset_to_window()
     bench.send(frames)
     replies = bench.collect(bench.waits.burst_s + bench.limit("inter_frame_s"))
     bench.judge.note_stimulus(heard=any(one.kind is Reply.NAK for one in replies))
@@ -579,8 +578,7 @@ def _reset_while_it_erases(bench: Bench) -> None:
     itself, and has to accept an upgrade.
     """
     image = bench.good_image
-    bench.reset_to_bootloader()
-    bench.wait_for_window()
+    bench.reset_to_window()
     bench.send(bench.encoder.update(len(image)) + bench.encoder.reset())
     # Boot versions sent before the update command arrived do not count (R11).
     bench.wait(UPDATE_SPACING_S)

@@ -160,8 +160,7 @@ def repeated(bench: Bench) -> None:
     image = bench.good_image
     update = bench.encoder.update(len(image))
     with bench.step("before request transfer"):
-        bench.reset_to_bootloader()
-        bench.wait_for_window()  # for a device that listens there only (UP-04)
+        bench.reset_to_window()  # for a device that listens there only (UP-04)
         bench.send(update + update)
         _expect_request(bench)
         _finish_requested(bench, bench.choice("up_05"))
@@ -355,8 +354,7 @@ def check_updates_rejected(bench: Bench, stimuli: Mapping[str, list[RawFrame]]) 
         choice = bench.choice("up_02") if is_update else "either"
         _check_update_rejected(bench, step, frames, choice)
     with bench.step("a valid update command at the same moment"):
-        bench.reset_to_bootloader()
-        bench.wait_for_window()
+        bench.reset_to_window()
         bench.send(bench.encoder.update(len(bench.good_image)))
         listens = bench.wait_for(Reply.REQUEST) is not None
         bench.judge.note_listening(listens=listens)
@@ -366,8 +364,7 @@ def check_updates_rejected(bench: Bench, stimuli: Mapping[str, list[RawFrame]]) 
 
 def _check_update_rejected(bench: Bench, step: str, frames: list[RawFrame], choice: str) -> None:
     with bench.step(step):
-        bench.reset_to_bootloader()
-        bench.wait_for_window()
+        bench.reset_to_window()
         bench.send(frames)
         replies = bench.collect(bench.waits.burst_s + bench.waits.silence_s)
         answers = [one for one in replies if not _is_version(one)]
