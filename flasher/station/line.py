@@ -244,6 +244,8 @@ class Line:
         self._effects: list[Effect] = []
         self._waiting: dict[str, Waiting] = {}
         """Scans that wait for another scan of the same source, by the source's name."""
+        self._scanned_at_s = 0.0
+        """Time at which the present scan was made."""
         self._reason = ""
         """Reason from a REASON command, for the next label."""
         self._reasons: dict[str, str] = {}
@@ -278,6 +280,7 @@ class Line:
             socket.occupancy = Occupancy.SILENT
 
     def _down(self, socket: Socket, what: AdapterDown, now: float) -> None:
+        socket.changed_at_s = now
         if socket.can_work or not socket.out_since_s:
             socket.out_since_s = now
         socket.out_of_service = what.reason or text("It cannot work.")
@@ -341,6 +344,7 @@ class Line:
 
     def _drop_for(self, socket: Socket, now: float, why: Refused, *, keeps_label: bool) -> None:
         """Drop the scans of a unit, and show that on its socket for a while."""
+        socket.changed_at_s = now
         if self._drop_scans(socket, why, keeps_label=keeps_label):
             socket.note = text("{reason} {remedy}", reason=why.reason, remedy=why.remedy)
             socket.note_until_s = now + NOTE_S
@@ -401,7 +405,7 @@ class Line:
         self.stop(Code.RECORD_NOT_SAVED.name, what.reason, what.remedy)
 
     def _ended(self, socket: Socket, _what: RunResult, now: float) -> None:
-        socket.phase = SocketPhase.SAVE
+        socket.phase, socket.changed_at_s = SocketPhase.SAVE, now
         socket.last, socket.is_last_there = LastRun(socket.serial), True
         # The run may have written its number: only later reports count.
         socket.own, socket.is_own_known = None, False
@@ -433,8 +437,9 @@ class Line:
 
     # -- scans ------------------------------------------------------------------------------------
 
-    def scan(self, raw: str, now: float, source: Source = UNNAMED) -> None:
-        """Process a scan."""
+    def scan(self, raw: str, now: float, source: Source = UNNAMED, *, age_s: float = 0.0) -> None:
+        """Process a scan that was made `age_s` ago."""
+        self._scanned_at_s = now - age_s
         scanned = raw.strip()
         crew = self._crew
         person = crew.find(scanned)
@@ -588,6 +593,8 @@ class Line:
         self._check_label(serial)
         check_first(self.sockets, serial, waiting)
         placed = place(self.sockets, serial, waiting.source)
+        if placed is not None:
+            self._check_in_time(placed[0])
         for other in self._waiting.values():
             if other.label == serial and other is not waiting:  # its last scan counts
                 self._drop_waiting(other, _dropped(text("It was scanned elsewhere."), _NOTHING))
@@ -605,6 +612,7 @@ class Line:
         """Process a label from a socket's own scanner. Raises Refused."""
         self._crew.check_assigned()
         self._check_label(serial)
+        self._check_in_time(socket)
         self._check_takes(socket)
         self._check_for(socket, serial, source)
         if socket.label == serial:  # this scanner needs no person: no proof of a unit
@@ -618,6 +626,7 @@ class Line:
         """
         try:
             self._check_label(serial)
+            self._check_in_time(card)
             self._check_for(card, serial, waiting.source)
         except Refused:
             self._forget_card(waiting)
@@ -661,6 +670,15 @@ class Line:
             remedy = text("{remedy} Then scan RESUME.", remedy=self.stopped.remedy)
             raise Refused("LINE_STOPPED", reason, remedy)
 
+    def _check_in_time(self, socket: Socket) -> None:
+        """Check that a scan was made after the last change in this socket. Raises Refused."""
+        if self._scanned_at_s < socket.changed_at_s:
+            raise Refused(
+                Code.NOT_OBSERVED.name,
+                text("The station stalled: the unit may have been exchanged after this scan."),
+                _CHANGED.remedy,
+            )
+
     def _check_label(self, serial: str) -> None:
         """Check that a label is of this recipe and its unit can be run now. Raises Refused."""
         self._check_line()
@@ -703,6 +721,7 @@ class Line:
             waiting.forget_at_s = None if waiting.card is None else now + CARD_LIMIT_S
         socket = self._named(argument)
         self._check_line()
+        self._check_in_time(socket)
         if waiting.card is not None and not is_again:
             raise self._in_doubt(waiting)
         if socket.is_chosen and not is_again:
@@ -738,6 +757,7 @@ class Line:
 
     def _abort(self, argument: str, _now: float, _waiting: Waiting) -> Socket:
         socket = self._named(argument)
+        self._check_in_time(socket)
         if socket.phase is not SocketPhase.RUN:
             reason = text("Nothing runs in socket {socket}.", socket=socket.name)
             raise Refused("NOT_RUNNING", reason, _NOTHING)
@@ -747,6 +767,7 @@ class Line:
 
     def _free(self, argument: str, _now: float, _waiting: Waiting) -> Socket:
         socket = self._named(argument)
+        self._check_in_time(socket)
         check_free(socket)
         reason = text("Socket {socket} is free.", socket=socket.name)
         self._drop_scans(socket, _dropped(reason, text("Scan it again when it is connected.")))

@@ -131,6 +131,8 @@ class Socket:
     """Time at which the label was assigned."""
     presence_number: int = 0
     """Number of the last reported change of presence."""
+    changed_at_s: float = float("-inf")
+    """Time at which its unit left or may have been exchanged, or a run ended."""
     arrived_at_s: float = 0.0
     """Time at which its unit was detected."""
     is_in_bootloader: bool = False

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import multiprocessing
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor, Future
@@ -93,6 +94,8 @@ from flasher.station.virtual_units import next_number, number_of_first
 
 TURN_S: Final = 0.1
 """Maximum time that a turn of the loop waits."""
+LATE_S: Final = 0.5
+"""A unit cannot be exchanged sooner after the scan of its label."""
 SCANS_ENDED: Final = "SCANS_ENDED"
 """Refusal code of labels that still wait after the last scan."""
 EventHandler = Callable[[StationEvent], None]
@@ -178,7 +181,14 @@ class Station:
         self.supervisor = WorkerSupervisor(setups, self.clock.monotonic_s, launch)
         self._runs: dict[str, ActiveRun] = {}
         """Claimed runs that are not saved yet, by socket."""
-        self._scans: deque[tuple[str, Source]] = deque()
+        self._scans: deque[tuple[str, Source, float]] = deque()
+        """Scans with the times at which they were submitted."""
+        self.timer: Callable[[], float] = time.perf_counter
+        """Clock for the age of scans."""
+        self._turned_at = self.timer()
+        """Time at which the last turn ended."""
+        self._stalled = (0.0, 0.0)
+        """Begin and end of the last pause between two turns that was too long."""
         self._published: deque[StationEvent] = deque()
         self._notes: deque[tuple[AuditEvent, Mapping[str, str]]] = deque()
         self._checked: deque[bool] = deque()
@@ -238,7 +248,7 @@ class Station:
 
     def submit(self, text: str, source: Source = UNNAMED) -> None:
         """Submit a scan. A card and its label come from the same source."""
-        self._scans.append((text, source))
+        self._scans.append((text, source, self.timer()))
         self._wake()
 
     def publish(self, event: StationEvent) -> None:
@@ -293,6 +303,9 @@ class Station:
             self.supervisor.wait([self._wake_receiver], limit_s)
         while self._wake_receiver.poll():
             self._wake_receiver.recv_bytes()
+        began_at = self.timer()
+        if began_at - self._turned_at > limit_s + LATE_S:
+            self._stalled = (self._turned_at, began_at)
         self.line.is_closing = self._is_stopping
         for socket, message in self.supervisor.poll():
             self._process_message(socket, message)
@@ -314,6 +327,16 @@ class Station:
         self._carry_out()
         self._publish_labels()
         self._on_turn()
+        self._turned_at = self.timer()
+
+    def _age_s(self, submitted_at: float) -> float:
+        """Age of a scan; 0 for one that could not be taken sooner than what sockets reported. While
+        this process stands still, no thread of it reads a scan either.
+        """
+        begin, end = self._stalled
+        made_at = min(submitted_at, begin) if submitted_at <= end + LATE_S else submitted_at
+        age_s = self.timer() - made_at
+        return age_s if age_s > LATE_S else 0.0
 
     def _take_scans(self) -> None:
         """Pass scans and results of PIN checks to the line; scans wait during a check."""
@@ -321,8 +344,8 @@ class Station:
             if self._checked:
                 self.line.pin_checked(self._now, is_right=self._checked.popleft())
             else:
-                text, source = self._scans.popleft()
-                self.line.scan(text, self._now, source)
+                text, source, submitted_at = self._scans.popleft()
+                self.line.scan(text, self._now, source, age_s=self._age_s(submitted_at))
             self._carry_out()
 
     def _take_answers(self) -> None:

@@ -144,6 +144,7 @@ class LineBench:
             checker=self.checker,
             gate=gate,
         )
+        self.station.timer = lambda: 0.0  # a slow computer of the tests is no stall
         self.station.start()
         for name in sockets:
             self.say(name, AdapterReady(sees_units=sees_units))

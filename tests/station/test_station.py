@@ -303,6 +303,44 @@ def test_a_label_without_its_unit_is_forgotten(line: LineBench) -> None:
     assert line.of(RunStarted) == []
 
 
+@pytest.mark.parametrize("are_read_late", [False, True])
+@pytest.mark.parametrize("is_exchanged", [False, True])
+@pytest.mark.parametrize("sockets", ["A", "AB"])
+def test_scans_that_waited_while_their_unit_was_exchanged_are_refused(
+    bench: Bench, sockets: str, is_exchanged: bool, are_read_late: bool
+) -> None:
+    """The station stands still, because of its disk or as a whole: scans and reports come at
+    once.
+    """
+    line = LineBench(bench, sockets)
+    line.arrive("A")
+    line.station.timer = bench.clock.monotonic_s
+    line.turn()
+    scans = (["SOCKET A"] if len(sockets) > 1 else []) + [SERIAL]
+    for scan in () if are_read_late else scans:
+        line.station.submit(scan)
+    bench.clock.go_on(3.0)
+    if is_exchanged:
+        line.ports["A"].said += [
+            PresenceChanged(is_there=False, number=1),
+            PresenceChanged(is_there=True, how="traffic", serial="", number=2),
+        ]
+    line.turn()
+    bench.clock.go_on(0.1)
+    for scan in scans if are_read_late else ():
+        line.scan(scan)
+    refused = [(event.text, event.code) for event in line.of(ScanRefused)]
+    assert bool(line.of(RunStarted)) != is_exchanged
+    if is_exchanged:
+        assert refused[0] == (scans[0], "NOT_OBSERVED")
+        assert refused[-1][0] == SERIAL
+        bench.clock.go_on(1.0)
+        line.turn()
+        for scan in scans:
+            line.scan(scan)
+    assert [event.serial for event in line.of(RunStarted)] == [SERIAL]
+
+
 def test_a_card_is_for_the_next_label_only(line: LineBench) -> None:
     line.scan("SOCKET B")
     line.scan("HELLO")
