@@ -11,9 +11,10 @@ import random
 import re
 import zlib
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from math import inf
 from typing import Final
 
 from flasher.api import Connection
@@ -23,6 +24,7 @@ from flasher.errors import UsageError
 from flasher.image.release import Release
 from flasher.mock.faults import AtTime, FaultInjector, PowerCut
 from flasher.mock.model import MockDevice
+from flasher.mock.place import Place
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import (
@@ -138,49 +140,20 @@ class VirtualUnit:
     """Devices by target; without power while the unit is in no socket."""
 
 
-class _Seat:
-    """Place of one target's device on the bus of a socket; an engine. Calls `look` with the time of
-    each event.
-    """
+class _Seat(Place):
+    """Place of one target's device in a socket. Calls `look` with the time of each event."""
 
     def __init__(self, look: Callable[[float], None]) -> None:
-        self.device: FaultInjector | None = None
-        self.due_at: float | None = None
-        """Time at which the next unit is put in."""
+        super().__init__()
         self._look = look
 
-    @property
-    def done(self) -> bool:
-        return self.device is None or self.device.done
-
     def receive(self, frame: Frame, now: float) -> None:
-        if self.device is not None:
-            self.device.receive(frame, now)
+        super().receive(frame, now)
         self._look(now)
 
     def tick(self, now: float) -> None:
-        if self.device is not None:
-            self.device.tick(now)
+        super().tick(now)
         self._look(now)
-
-    def deadline(self) -> float | None:
-        wanted = None if self.device is None else self.device.deadline()
-        due = [each for each in (wanted, self.due_at) if each is not None]
-        return min(due, default=None)
-
-    def next_frame(self, now: float) -> Frame | None:
-        return None if self.device is None else self.device.next_frame(now)
-
-    def frame_sent(self, now: float) -> None:
-        if self.device is not None:
-            self.device.frame_sent(now)
-
-    def cancel(self, now: float) -> None:
-        if self.device is not None:
-            self.device.cancel(now)
-
-    def take_events(self) -> Sequence[object]:
-        return () if self.device is None else self.device.take_events()
 
 
 class VirtualSocket:
@@ -309,7 +282,7 @@ class VirtualSocket:
             if now >= self._put_at:
                 self.put(self._in_hand)
                 self._in_hand = None
-                self._be_due(None)
+                self._be_due(inf)
                 self._is_other = True
             return
         if self._exchange_at_operation is None:
@@ -327,7 +300,7 @@ class VirtualSocket:
             self._in_hand, self._put_at = other, now + gap_s
             self._be_due(self._put_at)
 
-    def _be_due(self, at_s: float | None) -> None:
+    def _be_due(self, at_s: float) -> None:
         for seat in self._seats.values():
             seat.due_at = at_s
 

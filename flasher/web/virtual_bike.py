@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from enum import Enum
@@ -19,6 +19,7 @@ from flasher.i18n import text
 from flasher.mock.clients import ClientApplication
 from flasher.mock.faults import AtTime, FaultInjector, InOperation, PowerCut
 from flasher.mock.model import MockDevice
+from flasher.mock.place import Place
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, TARGETS, Dialect, Target
@@ -82,52 +83,23 @@ class _BikeClock:
         self._passed, self._running = self.now(), None
 
 
-class _Exchanged:
-    """Engine: place of a device that is taken out at a time, and replaced by another one."""
+class _Exchanged(Place):
+    """Place of a device that is taken out at `due_at`, and replaced by another one."""
+
+    done = False
 
     def __init__(self, made: Callable[[], FaultInjector]) -> None:
+        super().__init__()
         self._made = made
-        self._device: FaultInjector | None = made()
-        self._at = inf
-
-    def exchange(self, at_s: float) -> None:
-        self._at = at_s
-
-    @property
-    def done(self) -> bool:
-        return False
-
-    def receive(self, frame: Frame, now: float) -> None:
-        if self._device is not None:
-            self._device.receive(frame, now)
+        self.device = made()
 
     def tick(self, now: float) -> None:
-        if now >= self._at and self._device is not None:
-            self._device, self._at = None, now + _AWAY_S
-        elif now >= self._at:
-            self._device, self._at = self._made(), inf
-            self._device.device.power_on(now)
-        if self._device is not None:
-            self._device.tick(now)
-
-    def deadline(self) -> float | None:
-        wanted = None if self._device is None else self._device.deadline()
-        at = min(self._at, inf if wanted is None else wanted)
-        return None if at == inf else at
-
-    def next_frame(self, now: float) -> Frame | None:
-        return None if self._device is None else self._device.next_frame(now)
-
-    def frame_sent(self, now: float) -> None:
-        if self._device is not None:
-            self._device.frame_sent(now)
-
-    def cancel(self, now: float) -> None:
-        if self._device is not None:
-            self._device.cancel(now)
-
-    def take_events(self) -> Sequence[object]:
-        return () if self._device is None else self._device.take_events()
+        if now >= self.due_at and self.device is not None:
+            self.device, self.due_at = None, now + _AWAY_S
+        elif now >= self.due_at:
+            self.device, self.due_at = self._made(), inf
+            self.device.device.power_on(now)
+        super().tick(now)
 
 
 class VirtualBike:
@@ -201,7 +173,7 @@ class VirtualBike:
     def ended(self) -> None:
         """The upgrade has ended: the bike is exchanged if it is such a one."""
         for place in self._places:
-            place.exchange(self._clock.now() + _EXCHANGED_AFTER_S)
+            place.due_at = self._clock.now() + _EXCHANGED_AFTER_S
 
     def happened(self, event: object) -> None:
         job = self._job

@@ -150,7 +150,7 @@ def test_another_bike_than_the_one_shown_gets_nothing(
 
     bike._device = other  # type: ignore[method-assign]
     for socket in bike._places:
-        socket._device = socket._made()
+        socket.device = socket._made()
     state = place.do(_upgrade(state))
     error = state.trouble if state.done is None else state.done.error
     assert error is not None
@@ -638,7 +638,7 @@ def _lost(*_: object, **__: object) -> None:
 def test_another_battery_than_the_one_shown_is_not_saved(place: BenchPlace) -> None:
     place.do(order(BenchController.use_adapter, BikeFault.EXCHANGED.value))
     for socket in place.bikes._bikes[BikeFault.EXCHANGED.value]._places:
-        socket._device = socket._made()
+        socket.device = socket._made()
     state = place.do(order(back_up, ""))
     assert state.saved is None
     assert isinstance(state.trouble, WrongDeviceError)

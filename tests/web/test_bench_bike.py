@@ -127,7 +127,7 @@ def _exchange(place: BenchPlace) -> None:
     bike = place.bikes._bikes[BikeFault.EXCHANGED.value]
     bike._bikes = dict.fromkeys(bike._bikes, bike._bikes[BMS])
     for socket in bike._places:
-        socket._device = socket._made()
+        socket.device = socket._made()
 
 
 @pytest.mark.slow
@@ -153,14 +153,14 @@ def test_another_bike_begins_again_and_the_first_one_goes_on(place: BenchPlace) 
     upgraded(place)
     place.bench._stop.clear()
     bike.ended = lambda: None  # type: ignore[method-assign]
-    first = [socket._device for socket in bike._places]
+    first = [socket.device for socket in bike._places]
     _exchange(place)
     state = upgraded(place)
     assert state.trouble is not None
     assert state.trouble.code is ErrorCode.NOT_FOR_DEVICE
     assert outcome(state) == {"obc": "done", "wmc": "not begun", "bms": "not begun"}
     for socket, device in zip(bike._places, first, strict=True):
-        socket._device = device
+        socket.device = device
     state = upgraded(place)
     assert set(outcome(state).values()) == {"done"}
     assert [entry.target.name for entry in state.session] == ["obc", "wmc", "bms"]
@@ -252,7 +252,7 @@ def test_another_battery_before_the_next_device_ends_it(place: BenchPlace) -> No
 
     def exchange() -> None:  # at the end of each upgrade
         for socket in bike._places:
-            socket._device = socket._made()
+            socket.device = socket._made()
 
     bike.ended = exchange  # type: ignore[method-assign]
     state = upgraded(place)

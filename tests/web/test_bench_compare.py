@@ -67,7 +67,7 @@ def test_another_battery_than_the_one_shown_is_not_compared(place: BenchPlace) -
     chosen(place, BikeFault.EXCHANGED)
     bike = place.bikes._bikes[BikeFault.EXCHANGED.value]
     for socket in bike._places:
-        socket._device = socket._made()
+        socket.device = socket._made()
     state = place.do(compare)
     assert state.compared is None
     assert state.trouble is not None
@@ -150,7 +150,7 @@ def test_a_comparison_is_void_when_the_bike_is_exchanged(place: BenchPlace) -> N
 def test_a_comparison_is_void_when_another_unit_answers_at_once(place: BenchPlace) -> None:
     def exchange(place: BenchPlace) -> None:
         for socket in _bike(place)._places:
-            socket._device = socket._made()
+            socket.device = socket._made()
 
     assert _compared_and_then(place, exchange).compared is None
 

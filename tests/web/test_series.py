@@ -259,7 +259,7 @@ def test_another_unit_than_the_one_shown_is_not_written_to(place: BenchPlace) ->
         for target in session.bike._devices:
             session.bike._bikes[target] += 7
         for socket in session.bike._places:
-            socket._device = socket._made()
+            socket.device = socket._made()
 
     session.at[SeriesStep.UPGRADING] = exchange
     session.at[SeriesStep.REMOVAL] = session.stop_after(2)
@@ -283,7 +283,7 @@ def test_a_unit_taken_out_in_the_last_seconds_gets_nothing(
     def take_out() -> None:
         if len([each for each in session.steps if each.step is SeriesStep.SHOWN]) == 1:
             for socket in session.bike._places:
-                socket.exchange(session.bike._clock.now() + SHOWN_S - 1.0)
+                socket.due_at = session.bike._clock.now() + SHOWN_S - 1.0
 
     session.at[SeriesStep.SHOWN] = take_out
     session.at[SeriesStep.REMOVAL] = session.stop_after(2)
@@ -400,7 +400,7 @@ def test_an_adapter_on_which_sending_always_fails_ends_the_series(
     monkeypatch.setattr(type(place.bench.feed), "is_followed", True)
     monkeypatch.setattr(session.bike._link, "send", failing)
     for socket in session.bike._places:
-        socket._device, socket._at = None, inf
+        socket.device, socket.due_at = None, inf
     state = session.run()
     assert state.trouble is not None
     assert state.trouble.what == "The adapter does not send."
@@ -511,7 +511,7 @@ def test_a_unit_taken_out_in_its_upgrade_ends_the_series_with_its_rescue(
     def hold(event: object) -> None:
         if isinstance(event, events.PacketAcknowledged) and event.number == 5 and session.steps:
             for socket in session.bike._places:
-                socket.exchange(session.bike._clock.now())
+                socket.due_at = session.bike._clock.now()
 
     place.bikes.hold = hold
     state = session.run()
