@@ -18,6 +18,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.routing import BaseRoute, Route
 
+from flasher.bus.link import suspended_s
 from flasher.files import parse_json
 from flasher.i18n import text
 from flasher.protocol.text import printable
@@ -46,6 +47,8 @@ _PAGE_DIGITS: Final = 8
 SCAN_MAX: Final = 300
 """Maximum length of a scan from a page."""
 HEAD_EVERY_S: Final = 0.1
+SHOWN_LIMIT_S: Final = 3.0
+"""Maximum age of a page's last message when a scan of it arrives; older pages are covered."""
 SILENCE_LIMIT_S: Final = 1.5
 """Time without a turn of the station's loop after which the page shows the station as silent."""
 _HEAD: Final = "head"
@@ -282,14 +285,22 @@ class OperatorPage:
 
     async def _scan(self, request: Request) -> Response:
         try:
-            text = parse_json(await request.body())["text"]
+            scan = parse_json(await request.body())
+            text, shown_at = scan["text"], float(scan["shown_at"])
         except (ValueError, TypeError, KeyError):
             return JSONResponse({"error": "no scan"}, 400)
         if not isinstance(text, str) or not text.strip() or len(text) > SCAN_MAX:
             return JSONResponse({"error": "no scan"}, 400)
+        if _now() - shown_at > SHOWN_LIMIT_S:  # it waited: other units may be in the sockets
+            return JSONResponse({"error": "late"}, 409)
         # The station answers it by an event, which every page shows.
         await asyncio.to_thread(self._submit, text, _source_of(request))
         return JSONResponse({})
+
+
+def _now() -> float:
+    """Time of messages to pages, which goes on while this computer is suspended."""
+    return time.perf_counter() + suspended_s()
 
 
 def _source_of(request: Request) -> Source:
@@ -302,7 +313,7 @@ async def _messages(
     feed: Feed, translate: Translator, source: Source
 ) -> AsyncIterator[dict[str, Any]]:
     async for batch in feed.follow():
-        message: dict[str, Any] = {}
+        message: dict[str, Any] = {"at": _now()}
         if batch.is_all:
             message["all"] = True
         tiles = [_tile(state, translate) for _, state in batch.changes if isinstance(state, Row)]

@@ -476,7 +476,9 @@ def _type_in(scanner: int, text: str) -> None:
 
 
 def _scan_on_page(browser: httpx2.Client, text: str) -> None:
-    browser.post("/line/scan", json={"text": text}).raise_for_status()
+    browser.post(
+        "/line/scan", json={"text": text, "shown_at": time.perf_counter()}
+    ).raise_for_status()
 
 
 def line_of(folder: Path, sockets: int, seed: int) -> Line:

@@ -12,7 +12,7 @@ from typing import Literal
 
 import pytest
 from PIL import Image, ImageChops, ImageStat
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
 from flasher.i18n import text
 from flasher.station.events import (
@@ -28,6 +28,7 @@ from flasher.station.events import (
     SocketState,
 )
 from flasher.station.records.model import RunState
+from flasher.web import operator
 from tests.web.barriers import barriers
 from tests.web.conftest import Tab
 from tests.web.line_screen import AT, LineScreen, ended, served, tile
@@ -211,6 +212,24 @@ def test_a_scan_that_did_not_reach_the_station_is_said_and_forgotten(
     page.keyboard.press("Enter")
     page.wait_for_function("() => waiting.length === 0 && !isSending")
     assert line.scans == ["BAT2620-0002"]
+
+
+def test_a_scan_that_was_held_up_on_its_way_is_refused(
+    page: Page, tab: Tab, line: LineScreen, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A cable was unplugged for a minute: other units may be in the sockets when it arrives."""
+
+    def hold(route: Route) -> None:
+        monkeypatch.setattr(operator, "_now", lambda: time.perf_counter() + 60.0)
+        route.continue_()
+
+    page.route("**/line/scan", hold)
+    page.keyboard.type("BAT2620-0001")
+    page.keyboard.press("Enter")
+    expect(page.locator("#spoken")).to_contain_text("did not reach the station")
+    assert line.scans == []
+    assert ["409" in each for each in tab.wrong] == [True]
+    tab.wrong.clear()
 
 
 def test_a_refused_scan_is_said(page: Page, line: LineScreen) -> None:

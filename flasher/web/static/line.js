@@ -140,8 +140,7 @@ function showOffers(head) {
     }));
     put(part(".approve b"), offer.scan);
     part(".approve button").addEventListener("click", () => {
-      waiting.push(offer.scan);
-      send();
+      scanned(offer.scan);
     });
     return box;
   }));
@@ -168,6 +167,12 @@ function apply(message) {
 
 const waiting = [];
 let isSending = false;
+let shownAt = 0; // the station's time of the last message: it refuses scans that waited
+
+const scanned = (text) => {
+  waiting.push({ text, shown_at: shownAt });
+  send();
+};
 
 async function send() {
   if (isSending) {
@@ -176,7 +181,7 @@ async function send() {
   isSending = true;
   while (waiting.length) {
     try {
-      await post("/line/scan", { text: waiting[0] });
+      await post("/line/scan", waiting[0], 5000);
       waiting.shift();
     } catch {
       waiting.length = 0; // an old scan must not come by itself when other units are in the sockets
@@ -201,8 +206,7 @@ addEventListener("keydown", (event) => {
     const text = field.value;
     field.value = "";
     if (text.trim()) {
-      waiting.push(text);
-      send();
+      scanned(text);
     }
   } else if (event.key === "Escape") {
     field.value = "";
@@ -227,4 +231,7 @@ byId("sounds").addEventListener("click", async () => {
 });
 
 setInterval(() => put(byId("clock"), new Date().toLocaleTimeString(document.documentElement.lang)), 500);
-follow(`/line/events${location.search}`, apply);
+follow(`/line/events${location.search}`, (message) => {
+  shownAt = message.at;
+  apply(message);
+});

@@ -48,11 +48,12 @@ function follow(path, apply) {
   return () => Date.now() - opened;
 }
 
-async function post(path, body) {
+async function post(path, body, limitMs) {
   const answer = await fetch(path, {
     method: "POST",
     headers: { "x-flasher-token": token },
     body: body instanceof Blob ? body : JSON.stringify(body),
+    signal: limitMs ? AbortSignal.timeout(limitMs) : null,
   });
   if (answer.status === 403) {
     location.reload(); // the server was started anew, with other tokens
