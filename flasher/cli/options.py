@@ -198,9 +198,9 @@ _KEYWORDS: Final = ("interface", "channel", "bitrate", "fd", "data_bitrate")
 """Options with the names of python-can's keywords."""
 _FILTER: Final = re.compile(r"([0-9A-Fa-f]+)([:~])([0-9A-Fa-f]+)")
 _INVERTED: Final = 0x20000000
+"""python-can's flag for a filter that accepts all other ids."""
 _RIDING: Final = DeviceProfile(battery_use="riding")
 """A model with visible traffic."""
-"""python-can's flag for a filter that accepts all other ids."""
 
 
 def _timing(pairs: tuple[tuple[str, str], ...]) -> Any:

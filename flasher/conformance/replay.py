@@ -20,7 +20,6 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.spec import TARGETS, Node, Target, can_id
 from flasher.trace.decoder import Decoder
 
-"""A slower device gets the longest of these times for the answers of the recorded one."""
 _TAIL_S: Final = 1.0
 """Time after the last frame in which answers still count."""
 _POLL_S: Final = 0.2
@@ -123,6 +122,7 @@ class Player:
         self._port = subject.port
         self._answer_ids = _answer_ids(TARGETS[subject.target])
         self._patience_s = float(patience_s)
+        """How much longer a slower device gets for the answers of the recorded one."""
         self._stopped = stopped
         self._decoder = Decoder()
         self._messages = 0
