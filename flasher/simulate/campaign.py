@@ -129,7 +129,9 @@ class Tally:
     by_rescue: int = 0
     """Failed with an error; `rescue` without faults succeeded."""
     times: Mapping[int, int] = field(default_factory=dict)
-    """Number of good runs by the class of their time (`time_class`)."""
+    """Number of good runs by their time: four times the binary logarithm of its ratio to the time
+    that all frames take on the bus, rounded.
+    """
 
     def __add__(self, other: Tally) -> Tally:
         return Tally(
