@@ -23,6 +23,7 @@ from flasher.errors import ExitCode
 from flasher.settings.toml_reader import TomlTable
 from flasher.station.config import StationConfig
 from flasher.station.events import SocketState, StationEvent, StepStarted
+from flasher.station.export import seal
 from flasher.station.messages import AdapterDown
 from flasher.station.operators import BadgeTable
 from flasher.station.pins import Pin, is_right
@@ -460,6 +461,28 @@ def test_a_pin_on_a_terminal_is_typed_twice_without_echo(
     assert "PINs differ" in run.err
     run = flasher("station", "pin")
     assert is_right(Pin("470815"), run.out.strip())
+
+
+@pytest.mark.slow
+def test_a_passphrase_whose_input_ends_is_a_wrong_one(
+    flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def end(_prompt: str) -> str:
+        raise EOFError
+
+    sealed = tmp_path / "line-2.sealed"
+    seal(sealed, {"station.toml": b""}, "right horse battery")
+    keys = io.StringIO()
+    monkeypatch.setattr(keys, "isatty", lambda: True)
+    monkeypatch.setattr(sys, "stdin", keys)
+    monkeypatch.setattr("getpass.getpass", end)
+    spare = tmp_path / "spare.toml"
+    run = flasher(
+        "station", "take-over", "--sockets", spare, "--from", sealed, "--reason", "broken",
+        "--database", "postgresql://reader@127.0.0.1:1/flasher",
+    )  # fmt: skip
+    assert run.code == ExitCode.VERIFICATION
+    assert not spare.exists()
 
 
 # -- records ---------------------------------------------------------------------------------------
