@@ -111,54 +111,51 @@ def overviews(
 
 def judge(status: StationStatus, activity: Activity, bounds: Bounds) -> StationOverview:
     """Check a station."""
-    checks = (
-        _refused(status),
-        _silent(status, bounds),
-        _unsent(status, bounds),
-        _yield(activity, bounds),
-        _repeated(status.now, activity, bounds),
-        _clock(status, bounds),
-        _disk(status, bounds),
-    )
+    found = {
+        CheckKind.REFUSED: _refused(status),
+        CheckKind.SILENT: _silent(status, bounds),
+        CheckKind.UNSENT: _unsent(status, bounds),
+        CheckKind.YIELD: _yield(activity, bounds),
+        CheckKind.REPEATED: _repeated(status.now, activity, bounds),
+        CheckKind.CLOCK: _clock(status, bounds),
+        CheckKind.DISK: _disk(status, bounds),
+    }
+    checks = tuple(StationCheck(kind, *judged) for kind, judged in found.items())
     return StationOverview(status, activity, checks)
 
 
-def _check(kind: CheckKind, sentence: str, *, is_alert: bool) -> StationCheck:
-    return StationCheck(kind, CheckState.ALERT if is_alert else CheckState.OK, sentence)
+_Judged = tuple[CheckState, str]
 
 
-def _unknown(kind: CheckKind, sentence: str) -> StationCheck:
-    return StationCheck(kind, CheckState.UNKNOWN, sentence)
+def _alert_if(is_alert: bool) -> CheckState:  # noqa: FBT001  it is the one argument
+    return CheckState.ALERT if is_alert else CheckState.OK
 
 
-def _refused(status: StationStatus) -> StationCheck:
-    kind = CheckKind.REFUSED
+def _refused(status: StationStatus) -> _Judged:
     if status.refusal:
         reason = printable(status.refusal)
-        return _check(kind, text("its records are refused: {reason}", reason=reason), is_alert=True)
+        return CheckState.ALERT, text("its records are refused: {reason}", reason=reason)
     if status.reported_at is None:
-        return _unknown(kind, text("has never connected"))
-    return _check(kind, text("its records are accepted"), is_alert=False)
+        return CheckState.UNKNOWN, text("has never connected")
+    return CheckState.OK, text("its records are accepted")
 
 
-def _silent(status: StationStatus, bounds: Bounds) -> StationCheck:
-    kind = CheckKind.SILENT
+def _silent(status: StationStatus, bounds: Bounds) -> _Judged:
     if status.silent_s is None:
-        return _unknown(kind, text("has never connected"))
+        return CheckState.UNKNOWN, text("has never connected")
     seconds = status.silent_s
     if seconds > bounds.silent_s:
         sentence = text("silent for {duration}", duration=lasting(seconds))
-        return _check(kind, sentence, is_alert=True)
+        return CheckState.ALERT, sentence
     sentence = text("reported {duration} ago", duration=lasting(seconds))
-    return _check(kind, sentence, is_alert=False)
+    return CheckState.OK, sentence
 
 
 def _is_stale(status: StationStatus, bounds: Bounds) -> bool:
     return status.silent_s is None or status.silent_s > bounds.silent_s
 
 
-def _unsent(status: StationStatus, bounds: Bounds) -> StationCheck:
-    kind = CheckKind.UNSENT
+def _unsent(status: StationStatus, bounds: Bounds) -> _Judged:
     if status.unsent and status.oldest_unsent_at:
         # By the station's clock, as the time of the record.
         here = status.now + timedelta(seconds=status.clock_offset_s or 0.0)
@@ -169,32 +166,31 @@ def _unsent(status: StationStatus, bounds: Bounds) -> StationCheck:
             duration=lasting(max(age_s, 0.0)),
         )
         if age_s > bounds.unsent_s:
-            return _check(kind, sentence, is_alert=True)
+            return CheckState.ALERT, sentence
         if not _is_stale(status, bounds):
-            return _check(kind, sentence, is_alert=False)
+            return CheckState.OK, sentence
     if _is_stale(status, bounds) or status.unsent is None:
-        return _unknown(kind, text("not known while it is silent"))
-    return _check(kind, text("everything is sent"), is_alert=False)
+        return CheckState.UNKNOWN, text("not known while it is silent")
+    return CheckState.OK, text("everything is sent")
 
 
-def _yield(activity: Activity, bounds: Bounds) -> StationCheck:
-    kind, shift = CheckKind.YIELD, activity.shift
+def _yield(activity: Activity, bounds: Bounds) -> _Judged:
+    shift = activity.shift
     if shift.units < bounds.units_min or shift.yield_share is None:
         sentence = text(
             "too few units in this shift: {count} of {least}",
             count=shift.units,
             least=bounds.units_min,
         )
-        return _unknown(kind, sentence)
+        return CheckState.UNKNOWN, sentence
     sentence = text(
         "{passed} of {units} units of this shift passed", passed=shift.passed, units=shift.units
     )
-    return _check(kind, sentence, is_alert=shift.yield_share < bounds.yield_min)
+    return _alert_if(shift.yield_share < bounds.yield_min), sentence
 
 
-def _repeated(now: datetime, activity: Activity, bounds: Bounds) -> StationCheck:
+def _repeated(now: datetime, activity: Activity, bounds: Bounds) -> _Judged:
     """The worst socket."""
-    kind = CheckKind.REPEATED
     since = now - timedelta(seconds=bounds.repeats_within_s)
     found = []
     has_enough = False
@@ -212,27 +208,25 @@ def _repeated(now: datetime, activity: Activity, bounds: Bounds) -> StationCheck
             count=bounds.repeats,
             sockets=printable(", ".join(found)),
         )
-        return _check(kind, sentence, is_alert=True)
+        return CheckState.ALERT, sentence
     if not has_enough:
         sentence = text("no socket has {count} recent runs", count=bounds.repeats)
-        return _unknown(kind, sentence)
-    return _check(kind, text("no code repeats"), is_alert=False)
+        return CheckState.UNKNOWN, sentence
+    return CheckState.OK, text("no code repeats")
 
 
-def _clock(status: StationStatus, bounds: Bounds) -> StationCheck:
-    kind = CheckKind.CLOCK
+def _clock(status: StationStatus, bounds: Bounds) -> _Judged:
     if status.clock_offset_s is None or _is_stale(status, bounds):
-        return _unknown(kind, text("not known while it is silent"))
+        return CheckState.UNKNOWN, text("not known while it is silent")
     sentence = text("its clock differs by {seconds:+.1f} s", seconds=status.clock_offset_s)
-    return _check(kind, sentence, is_alert=abs(status.clock_offset_s) > bounds.clock_s)
+    return _alert_if(abs(status.clock_offset_s) > bounds.clock_s), sentence
 
 
-def _disk(status: StationStatus, bounds: Bounds) -> StationCheck:
-    kind = CheckKind.DISK
+def _disk(status: StationStatus, bounds: Bounds) -> _Judged:
     if status.disk_free_bytes is None or _is_stale(status, bounds):
-        return _unknown(kind, text("not known while it is silent"))
+        return CheckState.UNKNOWN, text("not known while it is silent")
     sentence = text("{size:.1f} GiB free", size=status.disk_free_bytes / 1024**3)
-    return _check(kind, sentence, is_alert=status.disk_free_bytes < bounds.disk_bytes)
+    return _alert_if(status.disk_free_bytes < bounds.disk_bytes), sentence
 
 
 def lasting(seconds: float) -> str:
