@@ -16,6 +16,7 @@ from queue import SimpleQueue
 from threading import Event, Lock
 from typing import Final, Self
 
+from flasher.errors import UsageError
 from flasher.processes import end_with_parent, signals_blocked
 from flasher.simulate.campaign import CORPUS_SEEDS, NO_FAULT, Batch, Found, Result, Tally, run_batch
 
@@ -126,7 +127,7 @@ class BatchProcess:
         self._run_one = run_one
         self._process: multiprocessing.process.BaseProcess | None = None
         self._pipe: Connection | None = None
-        self.exit_code: int | None = None
+        self.exit_code = 0
         """Of the process that was killed last."""
 
     def __enter__(self) -> Self:
@@ -146,16 +147,21 @@ class BatchProcess:
 
     def run_once(self, batch: Batch, is_stopped: Callable[[], bool]) -> Result:
         """As `run`, but raises EOFError if the process is killed."""
-        if self._pipe is None:
-            self._pipe = self._started()
+        pipe = self._pipe or self._start() or self._start()
+        if pipe is None:
+            raise UsageError(
+                f"A process for runs did not start: {_exit_text(self.exit_code)}.",
+                cause="memory is short, or the installed flasher was changed meanwhile",
+                remedy="Run again with fewer --jobs, and with the same --ledger if there was one.",
+            )
         is_stop_sent = False
         try:
-            self._pipe.send(batch)
-            while not self._pipe.poll(_POLL_S):
+            pipe.send(batch)
+            while not pipe.poll(_POLL_S):
                 if is_stopped() and not is_stop_sent:
-                    self._pipe.send(None)
+                    pipe.send(None)
                     is_stop_sent = True
-            result: Result | Exception = self._pipe.recv()
+            result: Result | Exception = pipe.recv()
         except (EOFError, OSError) as error:  # OSError: while it sent
             if self._process is not None:
                 self._process.join(_JOIN_S)
@@ -165,7 +171,10 @@ class BatchProcess:
             raise result
         return result
 
-    def _started(self) -> Connection:
+    def _start(self) -> Connection | None:
+        """Return the pipe of a new process; None if it ended before it took a batch: no run is to
+        blame.
+        """
         context = multiprocessing.get_context("spawn")
         pipe, far_end = context.Pipe()
         # The workers of a cluster are daemons, which `multiprocessing` lets start no process so
@@ -180,13 +189,20 @@ class BatchProcess:
             far_end.close()
             if is_daemon is not None:
                 config["daemon"] = is_daemon
+        self._pipe = pipe
+        try:
+            pipe.recv()
+        except (EOFError, OSError):
+            self._process.join(_JOIN_S)
+            self.end()
+            return None
         return pipe
 
     def end(self) -> None:
         if self._process is not None and self._pipe is not None:
             self._process.kill()
             self._process.join()
-            self.exit_code = self._process.exitcode
+            self.exit_code = self._process.exitcode or 0
             self._pipe.close()
             self._pipe = None
 
@@ -203,6 +219,7 @@ def _run_each(run_one: RunBatch, pipe: Connection, run_s: float) -> None:
     _begin_process()
     if hasattr(gc, "freeze"):  # PyPy has none
         gc.freeze()  # the modules do not become garbage: looking through them takes 5 % of a run
+    pipe.send(None)  # it has started
     while True:
         try:
             batch: Batch | None = pipe.recv()
@@ -264,15 +281,17 @@ def run_alone(
     return total
 
 
-def _killed(batch: Batch, seed: int, exit_code: int | None) -> Result:
+def _exit_text(exit_code: int) -> str:
+    return signal.Signals(-exit_code).name if exit_code < 0 else f"exit code {exit_code}"
+
+
+def _killed(batch: Batch, seed: int, exit_code: int) -> Result:
     """Result of a run that ended its process."""
     if batch.canary:
         return Result(batch.campaign, canaries_found={batch.canary: 1}, canary_runs=1)
-    how = f"ended its process: exit code {exit_code}"
-    if exit_code is not None and exit_code < 0:
-        how = f"ended its process: {signal.Signals(-exit_code).name}"
-        if how.endswith("SIGPROF"):
-            how = f"took more than {_RUN_S:g} s of CPU time"
+    how = f"ended its process: {_exit_text(exit_code)}"
+    if how.endswith("SIGPROF"):
+        how = f"took more than {_RUN_S:g} s of CPU time"
     text, plan, names = f"the run {how}", "", set[str]()
     if batch.walks is None:
         played = batch.plan_of(seed)

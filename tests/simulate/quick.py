@@ -63,6 +63,16 @@ def run_killing(batch: Batch, is_stopped: Callable[[], bool] = lambda: False) ->
     return run_quickly(batch, is_stopped)
 
 
+class Unloadable:
+    """`run_batch`, in whose process something is missing."""
+
+    def __call__(self, batch: Batch, is_stopped: Callable[[], bool] = lambda: False) -> Result:
+        raise NotImplementedError
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return os._exit, (4,)
+
+
 def run_killing_worker(batch: Batch, is_stopped: Callable[[], bool] = lambda: False) -> Result:
     """Run `KILLER` kills the worker that started its process."""
     if KILLER in range(batch.first, batch.first + batch.count):

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from flasher.errors import UsageError
 from flasher.simulate import workers
 from flasher.simulate.campaign import Batch, Found, Result, batches, campaign_key, run_batch
 from flasher.simulate.draw import drawn
@@ -18,6 +19,7 @@ from flasher.simulate.workers import Pace, RunBatch, run, run_alone
 from .quick import (
     FOLDER,
     KILLER,
+    Unloadable,
     no_result,
     run_endlessly,
     run_failing,
@@ -144,6 +146,17 @@ def test_an_error_of_a_process_ends_the_campaign() -> None:
             on_result=lambda *_: None,
             is_stopped=never,
             run_one=run_failing,
+        )
+
+
+def test_a_process_that_does_not_start_blames_no_run() -> None:
+    with pytest.raises(UsageError, match="did not start: exit code 4"):
+        run(
+            without_canaries(20, 20),
+            1,
+            on_result=lambda *_: pytest.fail("nothing has run"),
+            is_stopped=never,
+            run_one=Unloadable(),
         )
 
 
