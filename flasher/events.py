@@ -140,7 +140,7 @@ class PacketAcknowledged:
 
 @dataclass(frozen=True)
 class MessageRepeated:
-    """A message is sent again; `what` names it, `reason` is a `flasher.host.table.Reason`."""
+    """A message is sent again; `what` names it, `reason` says why."""
 
     what: str
     reason: str
@@ -182,7 +182,7 @@ class AttemptStarted:
 
 @dataclass(frozen=True)
 class QueryAnswered:
-    """The device answered a query; `content` is a `flasher.protocol.fields.Content`."""
+    """The device answered a query with `content`."""
 
     title: str
     content: object

@@ -98,7 +98,7 @@ def settings_of_items(
         content = None
         if entry.item.manufacturer_only:
             shown = {field: codec.show(shown[field]) for field, codec in entry.fields}
-        # An escape cannot be told from a backslash of the text.
+        # An escape cannot be distinguished from a backslash of the text.
         elif not any("\\" in each for each in shown.values()):
             content = make_content(entry, given)
             shown = {field: codec.show(getattr(content, field)) for field, codec in entry.fields}

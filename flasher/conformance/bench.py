@@ -187,7 +187,7 @@ class Bench:
 
     @property
     def window_edge_s(self) -> float:
-        """Margin around the window's end within which early and late cannot be told apart."""
+        """Margin around the window's end within which early and late cannot be distinguished."""
         return max(self.limit("window_tolerance_s"), 2 * self.port.uncertainty_s) + _EDGE_S
 
     def next_version(self) -> Received:

@@ -42,7 +42,7 @@ class VectorTable:
     reset_vector: int
     plausible: bool
     """The words look like a Cortex-M vector table at this address. Whether the program starts
-    inside the image is the question of `check_starts_inside`."""
+    inside the image is a check of its own."""
     problems: tuple[str, ...]
     notes: tuple[str, ...] = ()
     """Checks that could not be made, and why."""

@@ -214,7 +214,7 @@ def _detect(head: bytes, source: str) -> Format:
 
 
 def format_of_suffix(name: str) -> Format | None:
-    """Return the format that the suffix of a file name stands for."""
+    """Return the format that the suffix of a file name means."""
     return _SUFFIXES.get(PurePath(name).suffix.lower())
 
 

@@ -111,7 +111,7 @@ class Found:
     """Violation, and the plan that shows it."""
 
     seed: int
-    """Or the number of a plan of the corpus less `CORPUS_SEEDS`, so that it is below 0."""
+    """Or the number of a plan of the corpus less 1,000,000, so that it is below 0."""
     kind: str
     text: str
     plan: str
@@ -163,13 +163,13 @@ class Result:
     corpus_runs: int = 0
     endings: Mapping[str, int] = field(default_factory=dict)
     tallies: Mapping[str, Tally] = field(default_factory=dict)
-    """By the name of a clause that a plan contains; `NO_FAULT` for plans without a fault."""
+    """By the name of a clause that a plan contains; `none` for plans without a fault."""
     reached: tuple[str, ...] = ()
     """Sorted."""
     violations: tuple[Found, ...] = ()
     violation_count: int = 0
     excused: int = 0
-    """Successes beside a device that cannot be seen (`Violation.is_excused`)."""
+    """Successes beside a device that cannot be seen: kind UNSEEN of a violation."""
     canaries_found: Mapping[str, int] = field(default_factory=dict)
     canaries_missed: Mapping[str, int] = field(default_factory=dict)
     canary_runs: int = 0

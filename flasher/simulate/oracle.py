@@ -56,14 +56,14 @@ class SubjectFailedError(BaseException):
 class Violation:
     """Broken promise, of one of these kinds.
 
-    FALSE         a success that is none, or a version that nobody reported
+    FALSE         a success that is none, or a version that no device reported
     DISHONEST     a wrong statement about what the device has
     OVERDUE       the run did not end
     LATE          it ended after its deadline
     FAILED        no success, though nothing was disturbed, or earlier than its attempts may take
     UNDOCUMENTED  an exit code
     FOREIGN       a frame to another device
-    WIRE          a message that must not be sent then (`wire_rules`)
+    WIRE          a message that must not be sent then
     STATISTICS    impossible counts
     ACCUSED       one device reported as two
     CORRUPT       a device that would start what is no image
@@ -71,7 +71,7 @@ class Violation:
     CRASH         an exception of the code under test
     SUBJECT       a bootloader under test that crashed, hung, or used its flash wrongly
     KILLED        the process of the simulation died
-    UNSEEN        excused, see `is_excused`
+    UNSEEN        a success beside a device that cannot be seen; it is excused
     """
 
     kind: str
@@ -123,7 +123,7 @@ class UnitFacts:
     was_heard: bool
     """A message of its own reached the tool during the transfer."""
     runs_nothing: bool = False
-    """Its application is said to run, and its flash holds none."""
+    """Its application is reported to run, and its flash holds none."""
 
 
 @dataclass

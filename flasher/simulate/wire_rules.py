@@ -287,12 +287,12 @@ class WireRules:
     def _tool_begins(self, data: bytes, now: float) -> None:
         """Note when another tool writes, unless its frame may be taken for an echo."""
         sent_at = self._heads.get(data)
-        is_told_apart = sent_at is None or (self._has_all_echoes and now - sent_at > _ECHOED_S)
+        is_distinct = sent_at is None or (self._has_all_echoes and now - sent_at > _ECHOED_S)
         # Its second echo may have been taken for a copy of the first: another one is expected.
-        is_told_apart &= data not in self._sent_twice
+        is_distinct &= data not in self._sent_twice
         # The host takes it for the echo of its own frame, which still waits in the adapter.
-        is_told_apart &= all(each != data for each, _ in self._in_adapter)
-        if data[2] == WRITE and is_told_apart:
+        is_distinct &= all(each != data for each, _ in self._in_adapter)
+        if data[2] == WRITE and is_distinct:
             self._tool_at = now
 
     def _device_begins(self, data: bytes, now: float) -> None:

@@ -144,7 +144,7 @@ class UnitRemoved(StationEvent):
 
 @dataclass(frozen=True)
 class ScanAccepted(StationEvent):
-    """A scan was accepted: a label or a command (`flasher.station.scans`)."""
+    """A scan was accepted: a label or a command."""
 
     text: str
     meaning: str

@@ -166,7 +166,7 @@ def _circumstances(recorder: FlightRecorder, now: float) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str | None]:
-    """Versions of flasher, of what it stands on, and of the operating system."""
+    """Versions of flasher, of its libraries, and of the operating system."""
     return {
         **{name: _version(package) for name, package in _PACKAGES.items()},
         "python": platform.python_version(),

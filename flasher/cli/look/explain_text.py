@@ -77,8 +77,8 @@ def _upgrade_lines(upgrade: UpgradeStory, *, packets: bool, is_only: bool) -> It
         yield from _verdict_lines(upgrade.verdict, "  ")
     size = upgrade.image_size_bytes
     total = upgrade.total_packets
-    packets_said = "" if total is None else f", {counted(total, 'packet')}"
-    yield f"  image:         {'size unknown' if size is None else byte_count(size)}{packets_said}"
+    packets_text = "" if total is None else f", {counted(total, 'packet')}"
+    yield f"  image:         {'size unknown' if size is None else byte_count(size)}{packets_text}"
     yield f"  boot version:  {upgrade.boot_version or 'never announced'}"
     yield f"  running:       {upgrade.running_version or 'no version answer'}"
     for remark in upgrade.remarks:

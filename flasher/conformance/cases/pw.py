@@ -209,8 +209,8 @@ def _cut_text(cut: _Cut, total: int) -> str:
 
 
 def _upgrade(bench: Bench) -> _InterruptedUpgrade:
-    """Upgrade between the good image and a second one, so that the two can be told apart; recorded
-    as unsupported where they cannot.
+    """Upgrade between two images that can be distinguished; recorded as unsupported where they
+    cannot.
     """
     upgrade = _InterruptedUpgrade(bench.good_image, bench.subject.second_image or bench.good_image)
     same = version_in(upgrade.old) == version_in(upgrade.new) or version_in(upgrade.old) is None

@@ -33,7 +33,7 @@ _UPDATE_HEAD: Final = joined(Encoder("bms").update(0))[:6]
 """Start of a write of the update command, to any target."""
 _FIRST_PACKETS: Final = 3
 _MANY: Final = 24
-"""Transfers started without a restart in between, to find state that is left behind."""
+"""Transfers started without a restart in between, to find state that remains."""
 
 
 @case(
