@@ -229,7 +229,7 @@ class Procedures:
         if query.cancelled:
             raise _interrupted()
         if query.answer is None:
-            raise _no_answer(query)
+            raise self.link.health().error(str(self.link)) or _no_answer(query)
         return query.answer
 
     def read(self, item: str | type[Content]) -> Content:

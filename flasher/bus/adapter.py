@@ -36,6 +36,7 @@ from flasher.bus.health import (
     Layout,
     LinkHealth,
     bus_off_error,
+    refused_error,
     unreadable_error,
 )
 from flasher.bus.inspect_interface import Interface, read_interface
@@ -58,6 +59,11 @@ _STAMP_AGE_MAX_S: Final = 1.0
 """Maximum age of a frame by its time stamp; an older one means that the wall clock was set."""
 _UNREADABLE_LIMIT: Final = 100
 """Consecutive unreadable inputs after which the adapter counts as broken."""
+_REFUSED_LIMIT: Final = 36
+"""Frames in a row that an slcan adapter refuses, two whole packets, after which it counts as lost:
+its channel is closed after a restart, and opening it again may help."""
+_BEL: Final = b"\a"
+_CR: Final = b"\r"
 _SKIPPED_LIMIT: Final = 1000
 """Maximum number of inputs that one receive skips: a babbling serial port is never empty."""
 _WAIT_MIN_S: Final = 0.02
@@ -174,7 +180,9 @@ class CanLink:
         """pyserial port of the back end; None without one."""
         if self._port is not None and not self._send_options:
             self._port.write_timeout = SEND_LIMIT_S  # otherwise a full port blocks forever
-        self._unreadable_in_a_row = 0
+        self._unreadable_in_a_row = self._refused_in_a_row = 0
+        if self._port is not None and self._interface == "slcan":
+            self._count_refusals(self._port)
         self._instant_returns = 0
         """Consecutive receives that ended at once without a frame."""
         self._instant_since = 0.0
@@ -191,6 +199,23 @@ class CanLink:
             self._receive_raw = bus._recv_internal  # noqa: SLF001
         else:
             self._receive_raw = lambda timeout: (bus.recv(timeout), True)
+
+    def _count_refusals(self, port: Any) -> None:
+        """Count the frames that the adapter refuses: it answers them by BEL, which python-can drops
+        (and the commands that opened it, which do not count).
+        """
+        read = port.read
+
+        def counting(size: int = 1) -> bytes:
+            data: bytes = read(size)
+            if data == _BEL and self._health.sent:
+                self._health.refused += 1
+                self._refused_in_a_row += 1
+            elif data == _CR:
+                self._refused_in_a_row = 0
+            return data
+
+        port.read = counting
 
     @property
     def channel(self) -> str:
@@ -331,6 +356,9 @@ class CanLink:
             return None
         self._has_skipped_input = message is not None
         if message is None:
+            if self._refused_in_a_row >= _REFUSED_LIMIT:
+                self._refused_in_a_row = 0
+                raise refused_error(str(self), f"{_REFUSED_LIMIT} frames in a row")
             if began:
                 self._check_instant_return(began, timeout_s)
             return None

@@ -207,6 +207,8 @@ class LinkHealth:
     """Number of unreadable inputs from the adapter."""  # also before it was reopened
     last_unreadable: str
     """Description of the last unreadable input."""
+    refused: int = 0
+    """Number of frames that the adapter refused to send."""
 
     def error(self, where: str = "") -> BusError | None:
         """Create the BusError for this health; None for a healthy link."""
@@ -222,6 +224,8 @@ class LinkHealth:
                 remedy="Check power, wiring and bit rate; flasher doctor looks at the adapter.",
                 code=ErrorCode.NOBODY_ACKNOWLEDGES,
             )
+        if self.refused * 2 > self.frames_sent and not self.frames_received:
+            return refused_error(where, f"{self.refused} of {self.frames_sent} frames")
         if self.unreadable and not self.frames_received:
             return unreadable_error(where, f"{self.unreadable} times so far", self.last_unreadable)
         return None
@@ -243,6 +247,19 @@ def bus_off_error(where: str, what: str = "The adapter has left the bus.") -> Bu
         remedy="Check bit rate and wiring, then start the adapter again; flasher doctor names "
         "the command.",
         code=ErrorCode.BUS_OFF,
+    )
+
+
+def refused_error(where: str, how_many: str) -> BusError:
+    """Create the error for an adapter that does not send what it is given."""
+    return BusError(
+        f"The adapter refused to send {how_many}.",
+        where=where,
+        cause="its channel is closed because it restarted (a loose plug, too little power), its "
+        "queue is full because no node acknowledges, or it takes frames more slowly",
+        remedy="Check its plug, the wiring and the device's power, then run the same command "
+        "again; --frame-gap 0.001 is for a slow adapter.",
+        code=ErrorCode.SEND_BLOCKED,
     )
 
 
@@ -269,6 +286,7 @@ class HealthKeeper:
     def reset(self) -> None:
         """Reset all but the count of unreadable inputs, after the adapter was reopened."""
         self.sent = 0
+        self.refused = 0
         self.received = 0
         self.error_frames = 0
         self.is_blocked = False
@@ -333,4 +351,5 @@ class HealthKeeper:
             and is_evident,
             unreadable=self._unreadable,
             last_unreadable=self._last_unreadable,
+            refused=self.refused,
         )

@@ -147,7 +147,8 @@ class Recording:
         report = None if self._meter is None else self._meter.report()
         if report is None or self._connection is None:
             return report
-        return replace(report, unreadable=self._connection.link.health().unreadable)
+        health = self._connection.link.health()
+        return replace(report, unreadable=health.unreadable, refused=health.refused)
 
 
 @contextmanager

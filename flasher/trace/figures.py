@@ -101,6 +101,8 @@ class LinkReport:
     samples. Repeated packets are left out: the answer may belong to any copy."""
     unreadable: int | None = None
     """Number of inputs of the adapter that were not frames; None if not counted."""
+    refused: int | None = None
+    """Number of frames that the adapter refused to send; None if not counted."""
 
 
 class Transfer:

@@ -9,6 +9,7 @@ import time
 import uuid
 from collections import deque
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import can
@@ -643,6 +644,66 @@ def test_a_full_queue_is_remembered(bus: FakeBus, monkeypatch: pytest.MonkeyPatc
     with pytest.raises(TransmitBlockedError):
         link.send(FRAME)
     assert link.health().not_acknowledged
+
+
+class SlcanBus(FakeBus):
+    """Reads the answers of its serial adapter as python-can does, and drops them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.answers = deque[bytes]()
+        self.serialPortOrig = SimpleNamespace(
+            in_waiting=0, read=lambda _size=1: self.answers.popleft() if self.answers else b""
+        )
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        self.serialPortOrig.read(1)
+        self.serialPortOrig.in_waiting = len(self.answers)
+        return super()._recv_internal(timeout)
+
+
+@pytest.fixture
+def slcan() -> Any:
+    fake = SlcanBus()
+    yield fake
+    fake.shutdown()
+
+
+def refuse(link: CanLink, slcan: SlcanBus, *answers: bytes) -> None:
+    for answer in answers:
+        link.send(FRAME)
+        slcan.answers.append(answer)
+        link.receive(AT_ONCE)
+
+
+def test_an_adapter_that_refuses_frame_after_frame_is_lost(slcan: SlcanBus) -> None:
+    link = CanLink(slcan, "slcan", "/dev/ttyACM0")
+    slcan.answers.extend([b"\a"] * 50)  # to the commands that open it
+    link.drain()
+    assert link.health().refused == 0
+    refuse(link, slcan, *[b"\a"] * (adapter._REFUSED_LIMIT - 1), b"\r")
+    with pytest.raises(BusError, match="refused to send 36 frames in a row") as caught:
+        refuse(link, slcan, *[b"\a"] * adapter._REFUSED_LIMIT)
+    assert caught.value.code is ErrorCode.SEND_BLOCKED
+    assert "its channel is closed" in caught.value.cause
+    assert not isinstance(caught.value, TransmitBlockedError), "it is opened again"
+
+
+@each(
+    "answers, received, is_bad", [("aa", False, True), ("a\r", False, False), ("aa", True, False)]
+)
+def test_a_silent_bus_behind_an_adapter_that_refuses_most_frames_is_not_the_devices_fault(
+    slcan: SlcanBus, answers: str, *, received: bool, is_bad: bool
+) -> None:
+    link = CanLink(slcan, "slcan")
+    refuse(link, slcan, *[each_answer.replace("a", "\a").encode() for each_answer in answers])
+    if received:
+        slcan.inbox.append(message())
+        link.receive(AT_ONCE)
+    error = link.health().error()
+    assert (error is not None) is is_bad
+    if error is not None:
+        assert "refused to send 2 of 2 frames" in error.what
 
 
 # -- echoes of own frames -------------------------------------------------------------------------

@@ -100,7 +100,22 @@ def test_an_adapter_that_confirms_nothing_or_refuses_frames_is_overcome(adapter:
     draw = random.Random(4)
     adapter.program.confirms_frames = False
     adapter.program.refuses = lambda: draw.random() < 0.01
-    assert Flashed(adapter).is_good
+    flashed = Flashed(adapter)
+    assert flashed.is_good
+    assert flashed.health.refused > 0
+
+
+def test_an_adapter_that_restarts_with_its_channel_closed_is_opened_again(
+    adapter: Lawicel,
+) -> None:
+    def restart() -> None:
+        adapter.program.is_open = False
+
+    adapter.at_frame[100] = restart
+    flashed = Flashed(adapter)
+    assert flashed.is_good
+    (lost,) = (event for event in flashed.seen if isinstance(event, events.AdapterLost))
+    assert "refused to send 36 frames in a row" in lost.reason
 
 
 def test_an_adapter_that_is_pulled_out_and_plugged_in_again_goes_on(adapter: Lawicel) -> None:
@@ -228,3 +243,25 @@ def test_a_user_is_told_how_to_go_on_when_the_adapter_is_gone(adapter: Lawicel) 
     assert "State of the device: " in run.stderr
     assert "flasher rescue image.bin -t bms" in run.stderr
     assert "Traceback" not in run.stderr
+
+
+@pytest.mark.parametrize("words", [("info", "-t", "bms"), ("read", "serial-number", "-t", "bms")])
+def test_a_user_is_told_that_the_adapter_sends_nothing(
+    adapter: Lawicel, words: tuple[str, ...]
+) -> None:
+    adapter.program.refuses = lambda: True
+    bus = ("-i", "slcan", "-c", str(adapter.port), "--bus-kwargs", "sleep_after_open=0")
+    with adapter.device(MockDevice(BMS, bitrate_bps=WELLING.bitrate_bps)):
+        run = run_flasher(*words, *bus, "--no-bundle", folder=adapter.port.parent)
+    assert run.returncode == ExitCode.BUS
+    assert "The adapter refused to send" in run.stderr
+    assert "[E404]" in run.stderr
+
+
+def test_a_user_is_told_of_refused_frames(adapter: Lawicel) -> None:
+    count = itertools.count(1)
+    adapter.program.refuses = lambda: next(count) == 60
+    run = flash(adapter, "--json", "--no-bundle")
+    assert run.returncode == ExitCode.OK
+    assert json.loads(run.stdout)["link"]["refused"] == 1
+    assert "warning: 1 frame refused by the adapter; try --frame-gap 0.001" in run.stderr

@@ -11,7 +11,7 @@ from flasher.cli.look.content import content_lines, heard_document, heard_lines,
 from flasher.cli.options import Bus, bus_options, target_option
 from flasher.cli.output import Output
 from flasher.cli.recording import RecordingOptions, recorded_device, recording_options
-from flasher.errors import ErrorCode, ExitCode, NoAnswerError
+from flasher.errors import ErrorCode, ExitCode, FlasherError, NoAnswerError
 from flasher.procedures import INFO_LISTEN_ONLY_S, DeviceInfo, in_bootloader_error
 from flasher.protocol.spec import Target
 
@@ -59,7 +59,12 @@ def info(output: Output, target: Target, bus: Bus, recorded: RecordingOptions) -
     with recorded_device(recorded, bus, output, target) as (device, record):
         output.progress(f"asking the {target.node.name} on {device.connection.name} ...")
         found = device.identify()
-        error = no_application_error(found) if found.is_there else silence_error(found)
+        error: FlasherError | None
+        if found.is_there:
+            error = no_application_error(found)
+        else:
+            connection = device.connection
+            error = connection.link.health().error(connection.name) or silence_error(found)
         if error is not None:
             record.failed(error)
     if error is not None:

@@ -268,8 +268,8 @@ class _Upgrade:
         if document is not None and document.link is not None:
             for line in text.link_lines(document.link):
                 output.progress(line, level=1)
-            if document.link.unreadable:
-                output.error_line(f"warning: {text.unreadable_line(document.link.unreadable)}")
+            for warning in text.adapter_warnings(document.link):
+                output.error_line(f"warning: {warning}")
         verdict = text.verdict_of(result, upgrade_run.checks, upgrade_run.took_s)
         if error is None:
             output.verdict(verdict)

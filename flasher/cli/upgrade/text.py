@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Final
@@ -263,10 +263,15 @@ def link_lines(report: LinkReport) -> list[str]:
     ]
 
 
-def unreadable_line(count: int) -> str:
-    """Describe unreadable inputs, which slow an upgrade down without stopping it."""
-    times = "once" if count == 1 else f"{count:,} times"
-    return f"{times} the adapter delivered unreadable frames; try another cable, port or adapter"
+def adapter_warnings(link: LinkReport) -> Iterator[str]:
+    """Describe faults of the adapter, which slow an upgrade down without stopping it."""
+    if link.unreadable:
+        times = "once" if link.unreadable == 1 else f"{link.unreadable:,} times"
+        what = f"{times} the adapter delivered unreadable frames"
+        yield f"{what}; try another cable, port or adapter"
+    if link.refused:
+        what = f"{counted(link.refused, 'frame')} refused by the adapter"
+        yield f"{what}; try --frame-gap 0.001, or another port or adapter"
 
 
 def _running(result: Result) -> str:
