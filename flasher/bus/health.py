@@ -73,8 +73,6 @@ _BUS_OFF: Final = 0x040
 _BUS_ERROR: Final = 0x080
 _RESTARTED: Final = 0x100
 _COUNTERS: Final = 0x200
-_WARNING_BITS: Final = 0x04 | 0x08
-_PASSIVE_BITS: Final = 0x10 | 0x20
 _ACTIVE_BIT: Final = 0x40
 _ACK_SLOT: Final = 0x19
 """Position code of the acknowledge slot, the SJA1000's in both formats."""

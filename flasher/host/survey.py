@@ -70,7 +70,8 @@ class Survey(Runner[None]):
         """The survey was cancelled while listening or during a query."""
         self.other_tool_heard = False
         """Another tool sent as CDL, so that no query was sent."""
-        self._faults: Faults | None = None
+        self.faults: Faults | None = None
+        """Fault flags that the BMS sent during the survey; None if it sent none."""
         self._dialect = dialect
         self._ids: set[int] = set()
         super().__init__(
@@ -79,11 +80,6 @@ class Survey(Runner[None]):
             timings=timings,
         )
         self.watch = self._count
-
-    @property
-    def faults(self) -> Faults | None:
-        """Fault flags that the BMS sent during the survey; None if it sent none."""
-        return self._faults
 
     def guess_dialect(self) -> tuple[Dialect | None, str]:
         """Guess the dialect from the traffic; return it (None if unclear) and the reason."""
@@ -151,8 +147,8 @@ class Survey(Runner[None]):
             title = _title(decoded.item)
             heard.last[title] = decoded.content
             if isinstance(decoded.content, Faults) and heard.node is Node.BMS:
-                before = BatteryFault(0) if self._faults is None else self._faults.faults
-                self._faults = Faults(before | decoded.content.faults)
+                before = BatteryFault(0) if self.faults is None else self.faults.faults
+                self.faults = Faults(before | decoded.content.faults)
         elif found.command in _UPGRADE:
             row = messages.decode(found)
             if isinstance(row, messages.BootVersion):

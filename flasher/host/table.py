@@ -92,19 +92,6 @@ class Ending(Enum):
     CANCELLED = "cancelled"
 
 
-ENDED_BEFORE_START: Final = frozenset(
-    {
-        Ending.IMPLAUSIBLE,
-        Ending.NOT_FOR_DEVICE,
-        Ending.NOT_TRUSTED,
-        Ending.IN_USE,
-        Ending.LOW_CHARGE,
-        Ending.UP_TO_DATE,
-    }
-)
-"""Endings of a session before its upgrade begins, which are not in the table."""
-
-
 class Reason(Enum):
     """Reason why a message or the whole upgrade is repeated."""
 

@@ -15,7 +15,6 @@ from flasher.errors import ErrorCode, ImageError
 from flasher.image.image import ADDRESS_SPACE
 from flasher.image.segments import SparseBytes
 
-FORMAT: Final = "ELF"
 MAGIC: Final = b"\x7fELF"
 EM_ARM: Final = 40
 _MACHINES: Final = {

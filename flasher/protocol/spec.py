@@ -27,7 +27,6 @@ PREFIX_SIZE: Final = len(HEADER) + MODE_SIZE + LENGTH_SIZE
 """Number of bytes of a message before its command."""
 OVERHEAD_SIZE: Final = PREFIX_SIZE + CRC_SIZE + len(TAIL)
 """Number of bytes of a message that its length field does not count."""
-MESSAGE_MIN_SIZE: Final = OVERHEAD_SIZE + LENGTH_MIN
 MESSAGE_MAX_SIZE: Final = OVERHEAD_SIZE + LENGTH_MAX
 FRAME_DATA_SIZE: Final = 8
 """Data bytes of each CAN frame of a message; the last may be shorter (2.2.3)."""

@@ -158,10 +158,14 @@ def _differs(shown: str, name: str) -> ImageError:
 # -- what the trust file says ----------------------------------------------------------------------
 
 
-def unsigned(source: str, store: TrustStore | None = None) -> Provenance:
+def unsigned(source: str) -> Provenance:
     """Provenance of an image without a release, on a computer with a trust file."""
-    problem = _load_problem(store or TrustStore())
-    if problem is None:
+    problem: FlasherError
+    try:
+        TrustStore().load()
+    except FlasherError as error:
+        problem = error
+    else:
         problem = ImageError(
             text("{file} is not signed.", file=printable(source)),
             remedy=Text(
@@ -174,14 +178,6 @@ def unsigned(source: str, store: TrustStore | None = None) -> Provenance:
             code=ErrorCode.RELEASE_UNSIGNED,
         )
     return Provenance(text=text("the image is not signed"), problem=problem)
-
-
-def _load_problem(store: TrustStore) -> FlasherError | None:
-    try:
-        store.load()
-    except FlasherError as error:
-        return error
-    return None
 
 
 def unchecked(source: str, *, is_required: bool) -> Provenance:
@@ -203,7 +199,6 @@ def provenance_of(
     target: Target,
     today: datetime.date,
     *,
-    store: TrustStore | None = None,
     is_required: bool = False,
 ) -> Provenance:
     """Check a release against the trust file of this computer, and store what it brings: a newer
@@ -211,7 +206,7 @@ def provenance_of(
 
     A computer that cannot store it is warned.
     """
-    store = store or TrustStore()
+    store = TrustStore()
     warnings: list[str] = []
     try:
         known = store.load()

@@ -37,9 +37,9 @@ from flasher.web.bench_watch import watch
 from flasher.web.pages import Pages, streamed
 from flasher.web.series import SHOWN_S, take_next_bikes
 
-UPLOAD_MAX: Final = 32 * 1024 * 1024
-"""Maximum upload in bytes, above the largest image as Intel HEX."""
 UPLOAD: Final = "/bench/upload"
+UPLOADS: Final = {UPLOAD: 32 * 1024 * 1024}
+"""Maximum upload in bytes, above the largest image as Intel HEX."""
 _FILES_MAX: Final = 200
 """Maximum number of files of a folder that are checked."""
 _MANIFEST: Final = ".toml"
@@ -155,11 +155,6 @@ class Shelf:
 
 def _belongs_to_image(path: Path, *suffixes: str) -> bool:
     return path.suffix.lower() in suffixes and path.with_suffix("").is_file()
-
-
-def upload_limit(usual: int) -> Callable[[str], int]:
-    """Maximum body size of a path in bytes, for the guard."""
-    return lambda path: UPLOAD_MAX if path == UPLOAD else usual
 
 
 class BenchPage:

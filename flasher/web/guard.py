@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import hmac
 import secrets
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
+from types import MappingProxyType
 from typing import Any, Final
 
 from anyio import CancelScope
@@ -91,13 +92,13 @@ def application(
     login: Login | None = None,
     entry: BrowserEntry | None = None,
     is_tls: bool = False,
-    uploads: Callable[[str], int] = lambda _path: BODY_MAX,
+    uploads: Mapping[str, int] = MappingProxyType({}),
 ) -> ASGIApp:
     """Wrap the pages in the access control.
 
     `hosts`: names of this server, without port; `secret` signs the cookies; `login` checks
     sign-ins, and `entry` admits one browser (without either the pages are open to all); `uploads`
-    returns the maximum body size of a path in bytes.
+    has the maximum body size in bytes of paths that take more than `BODY_MAX`.
     """
     own: list[BaseRoute] = [
         *([] if entry is None else entry.routes),
@@ -127,12 +128,10 @@ def application(
 class _Guard:
     """Outermost layer: checks host, origin and size, and sets headers."""
 
-    def __init__(
-        self, app: ASGIApp, hosts: Collection[str], limit_of: Callable[[str], int]
-    ) -> None:
+    def __init__(self, app: ASGIApp, hosts: Collection[str], uploads: Mapping[str, int]) -> None:
         self._app = app
         self._hosts = frozenset(host.lower() for host in hosts)
-        self._limit_of = limit_of
+        self._uploads = uploads
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -151,7 +150,8 @@ class _Guard:
         if refusal is not None:
             await refusal(scope, receive, send_guarded)
             return
-        await self._app(scope, _limited(receive, self._limit_of(scope["path"])), send_guarded)
+        limit = self._uploads.get(scope["path"], BODY_MAX)
+        await self._app(scope, _limited(receive, limit), send_guarded)
 
     def _refusal(self, scope: Scope) -> Response | None:
         headers = Headers(scope=scope)
@@ -165,7 +165,7 @@ class _Guard:
         if headers.get("origin", "") != f"{scope['scheme']}://{host}":
             return PlainTextResponse("The request comes from another page.", 403)
         length = headers.get("content-length", "0")
-        if not length.isdigit() or int(length) > self._limit_of(scope["path"]):
+        if not length.isdigit() or int(length) > self._uploads.get(scope["path"], BODY_MAX):
             return PlainTextResponse("The request is too large.", 413)
         return None
 

@@ -81,6 +81,8 @@ YEARS: Final = range(2000, 2100)
 """Years of the times in a form. Periods around them are times too, with few enough shifts."""
 CHECK: Final = "/certificate"
 """Path of the page that checks a certificate."""
+UPLOADS: Final = {CHECK: CERTIFICATE_MAX_SIZE}
+"""Maximum body size in bytes of pages that accept a file."""
 _NAMES: Final = {
     "/runs": text("Runs"),
     "/units": text("Units"),
@@ -474,11 +476,6 @@ def frame(question: Question, now: datetime, names: Mapping[str, str] = _NAMES) 
         "at": lambda moment: "" if moment is None else f"{moment.astimezone():%Y-%m-%d %H:%M:%S}",
         "sign_in": question.sign_in,
     }
-
-
-def upload_limit(usual: int) -> Callable[[str], int]:
-    """Maximum body size of a path in bytes, for the guard."""
-    return lambda path: CERTIFICATE_MAX_SIZE if path == CHECK else usual
 
 
 Place = tuple[str, Path, KeyLocations]

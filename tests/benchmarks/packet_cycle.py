@@ -29,13 +29,13 @@ from flasher.bus.adapter import CanLink, open_adapter
 from flasher.bus.link import MonotonicClock
 from flasher.bus.simulated import SimulatedBus
 from flasher.driver import drive
-from flasher.host.upgrade import Upgrade
 from flasher.image.image import Image
 from flasher.image.plan import plan
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, PACKET_DATA_SIZE, WELLING
+from tests.host.upgrade import Upgrade
 
 BUSY_WAIT_S = 0.0001
 """Real seconds before a moment that a paced clock spends in a busy loop."""

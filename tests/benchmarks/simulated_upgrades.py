@@ -22,7 +22,6 @@ from itertools import count, islice
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
 from flasher.driver import drive
-from flasher.host.upgrade import Upgrade
 from flasher.image.image import Image
 from flasher.image.plan import plan
 from flasher.mock.model import MockDevice
@@ -32,6 +31,7 @@ from flasher.simulate import plan as plans
 from flasher.simulate.campaign import without_log
 from flasher.simulate.draw import drawn
 from flasher.simulate.play import Player
+from tests.host.upgrade import Upgrade
 
 PACKETS = 16
 """Of an image of 2 KiB."""

@@ -14,7 +14,6 @@ from flasher.api import Connection
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
 from flasher.host.options import UpgradeOptions
-from flasher.host.upgrade import Upgrade
 from flasher.image.image import Image
 from flasher.image.plan import plan
 from flasher.protocol.engine import Engine
@@ -22,6 +21,7 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WELLING, Dialect
 from flasher.protocol.timing import Timings
 from tests.cli.conftest import Flasher
+from tests.host.upgrade import Upgrade
 from tests.peers.wording import build, payloads
 
 IMAGE = b"V2r0r0_20260101".ljust(300, b"\x5a")

@@ -15,7 +15,6 @@ from flasher.driver import drive
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft, Outcome
 from flasher.host.table import Ending
-from flasher.host.upgrade import Upgrade
 from flasher.image.image import Image
 from flasher.image.plan import plan
 from flasher.mock.model import MockDevice
@@ -24,6 +23,7 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, OBC, TARGETS, WELLING, WMC
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from tests.end_to_end.world import Traffic, upgrade
+from tests.host.upgrade import Upgrade
 from tests.loops import each
 
 IMAGE = random.Random(3).randbytes(300)

@@ -6,7 +6,6 @@ import pytest
 
 from flasher import api, events
 from flasher.errors import ExitCode
-from flasher.host.upgrade import Upgrade
 from flasher.image.plan import plan
 from flasher.mock.model import MockDevice
 from flasher.protocol.bittime import frame_bits
@@ -14,6 +13,7 @@ from flasher.protocol.engine import Engine, Tap
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, OBC, WELLING, WMC
 from tests.end_to_end.stage import IMAGE, NEW, SMALL, Speaker, Stage, image_of
+from tests.host.upgrade import Upgrade
 from tests.loops import each
 
 

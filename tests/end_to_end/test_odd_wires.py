@@ -14,7 +14,6 @@ from flasher.driver import drive
 from flasher.errors import BusError
 from flasher.host.outcome import Outcome
 from flasher.host.table import Ending
-from flasher.host.upgrade import Upgrade
 from flasher.image.image import Image
 from flasher.image.plan import plan
 from flasher.mock.model import MockDevice
@@ -22,6 +21,7 @@ from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WELLING
 from tests.end_to_end.world import upgrade
+from tests.host.upgrade import Upgrade
 from tests.loops import each
 from tests.peers.wording import REPORT, build, payloads
 

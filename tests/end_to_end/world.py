@@ -10,12 +10,12 @@ from flasher.bus.simulated import Disturbance, SimulatedBus
 from flasher.driver import drive
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import Outcome
-from flasher.host.upgrade import Upgrade
 from flasher.image.image import Image
 from flasher.image.plan import plan
 from flasher.protocol.engine import Engine
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import TARGETS, WELLING
+from tests.host.upgrade import Upgrade
 
 IMAGE = random.Random(7).randbytes(10 * 128 - 3)
 

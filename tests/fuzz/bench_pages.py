@@ -16,8 +16,8 @@ from flasher.translation import ENGLISH
 from flasher.web.archive import PAGES as KEPT
 from flasher.web.archive import Archive
 from flasher.web.bench import BenchController
-from flasher.web.bench_page import _ORDERS, UPLOAD, BenchPage, upload_limit
-from flasher.web.guard import BODY_MAX, application
+from flasher.web.bench_page import _ORDERS, UPLOAD, UPLOADS, BenchPage
+from flasher.web.guard import application
 from flasher.web.pages import Pages
 from flasher.web.query_processes import Answer, Question, answer_routes
 from tests.fuzz import browser
@@ -60,7 +60,7 @@ class _Bench:
             [*self.page.routes, *answer_routes(pages, ask, KEPT)],
             hosts={"127.0.0.1"},
             secret=browser.SECRET,
-            uploads=upload_limit(BODY_MAX),
+            uploads=UPLOADS,
         )
         self.folder = self.place.shelf.folder
         self.files = self._files()

@@ -12,7 +12,6 @@ from typing import TypeVar
 
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import Outcome
-from flasher.host.upgrade import Upgrade
 from flasher.image.image import Image
 from flasher.image.plan import plan
 from flasher.protocol.bittime import frame_bits
@@ -35,6 +34,7 @@ from flasher.protocol.messages import (
 from flasher.protocol.spec import BMS, WELLING, Target
 from flasher.protocol.wire import Message, Reassembler, encode, split
 from tests.firmware import VECTORS
+from tests.host.upgrade import Upgrade
 
 BOOT = BootVersion("BMS", "V1.2.3")
 SentRow = TypeVar("SentRow", bound=UpgradeMessage | Message)

@@ -11,7 +11,6 @@ from flasher.errors import ExitCode
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft
 from flasher.host.table import Ending, UpgradeState
-from flasher.host.upgrade import Upgrade
 from flasher.image.plan import plan
 from flasher.protocol.messages import (
     Ack,
@@ -29,6 +28,7 @@ from flasher.protocol.spec import BMS, OBC, WMC, Target
 from flasher.protocol.text import encode_text
 from flasher.protocol.wire import Message
 from tests.host.bench import BOOT, Bench, answer_frames, image_of
+from tests.host.upgrade import Upgrade
 from tests.loops import each
 
 NEW = "V2r0r1_20260102"

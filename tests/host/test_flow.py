@@ -12,7 +12,6 @@ from flasher.events import Phase
 from flasher.host.options import UpgradeOptions, default_timeout_s
 from flasher.host.outcome import DeviceLeft
 from flasher.host.table import Ending, UpgradeState
-from flasher.host.upgrade import Upgrade
 from flasher.image.plan import plan
 from flasher.protocol.frame import Frame
 from flasher.protocol.messages import (
@@ -28,6 +27,7 @@ from flasher.protocol.messages import (
 from flasher.protocol.spec import BMS, OBC, WELLING, WMC, Target
 from flasher.protocol.timing import Timings
 from tests.host.bench import BOOT, Bench, answer_frames, image_of
+from tests.host.upgrade import Upgrade
 from tests.loops import each
 
 

@@ -14,7 +14,7 @@ from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import ended_before_start
 from flasher.host.session import Result, UpgradeSession
 from flasher.host.table import Ending, UpgradeState
-from flasher.host.upgrade import Upgrade, UpgradeStage
+from flasher.host.upgrade import UpgradeStage
 from flasher.image.image import Image
 from flasher.image.plan import plan
 from flasher.protocol.fields import Content, TextField, WireText, field
@@ -23,6 +23,7 @@ from flasher.protocol.spec import BMS, WELLING, WMC
 from flasher.protocol.text import encode_text
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.settings.manifest import release_of
+from tests.host.upgrade import Upgrade
 
 IMAGE = Image.from_bytes(bytes(300))
 PLAN = plan(IMAGE, BMS, WELLING.bitrate_bps)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from flasher.host.outcome import _EXPLANATIONS
-from flasher.host.table import ENDED_BEFORE_START, TABLE, TIMERS, Ending, UpgradeEvent, UpgradeState
+from flasher.host.table import TABLE, TIMERS, Ending, UpgradeEvent, UpgradeState
 from flasher.host.upgrade import UpgradeStage
 from tests.loops import each
 
@@ -26,6 +26,15 @@ FROM_THE_WIRE = {
     UpgradeEvent.COMPLETE,
     UpgradeEvent.UNEXPECTED,
 }
+ENDED_BEFORE_START = {
+    Ending.IMPLAUSIBLE,
+    Ending.NOT_FOR_DEVICE,
+    Ending.NOT_TRUSTED,
+    Ending.IN_USE,
+    Ending.LOW_CHARGE,
+    Ending.UP_TO_DATE,
+}
+"""Endings of a session before its upgrade begins, which are not in the table."""
 
 
 def moves() -> list[tuple[UpgradeState, UpgradeEvent, str, set[UpgradeState | Ending]]]:

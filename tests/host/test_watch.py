@@ -11,7 +11,6 @@ from flasher import events
 from flasher.events import Phase
 from flasher.host.options import UpgradeOptions
 from flasher.host.table import Ending
-from flasher.host.upgrade import Upgrade
 from flasher.image.plan import plan
 from flasher.protocol.messages import (
     BootVersion,
@@ -26,6 +25,7 @@ from flasher.protocol.spec import BMS, WELLING
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 from flasher.protocol.wire import Message
 from tests.host.bench import BOOT, Bench, answer_frames
+from tests.host.upgrade import Upgrade
 from tests.loops import each
 
 WATCH_S, SPACING_S = DEFAULT_TIMINGS.boot_watch_s, DEFAULT_TIMINGS.boot_version_spacing_s

@@ -11,7 +11,6 @@ from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus, SimulatedLink
 from flasher.driver import drive
 from flasher.events import DeviceStateEntered, ImageStored
-from flasher.host.upgrade import Upgrade
 from flasher.image.image import Image
 from flasher.image.plan import plan
 from flasher.mock.profile import DeviceProfile
@@ -19,6 +18,7 @@ from flasher.mock.system import System
 from flasher.mock.table import BootloaderState
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, MOTINOVA, TARGETS, WELLING, WMC, Dialect, Node, Target
+from tests.host.upgrade import Upgrade
 from tests.loops import each
 from tests.mock.bench import image_of
 from tests.mock.talk import READ, WRITE, Talk

@@ -127,7 +127,7 @@ def test_modes_and_frame_of_a_message_are_the_documents() -> None:
     assert (Mode.READ, Mode.WRITE, Mode.REPORT) == (0x11, 0x16, 0x0C)
     assert (spec.HEADER, spec.TAIL) == (b"\x55\xaa", b"\xf0")
     assert (spec.LENGTH_MIN, spec.LENGTH_MAX) == (2, 255)
-    assert (spec.MESSAGE_MIN_SIZE, spec.MESSAGE_MAX_SIZE) == (11, 264)
+    assert (spec.OVERHEAD_SIZE + spec.LENGTH_MIN, spec.MESSAGE_MAX_SIZE) == (11, 264)
     assert spec.FRAME_DATA_SIZE == 8
     assert spec.FRAMES_PER_PACKET == 18
 

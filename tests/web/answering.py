@@ -11,16 +11,15 @@ from starlette.types import ASGIApp
 
 from flasher.station.records.keys import KeyLocations
 from flasher.station.shift_counts import DEFAULT_SHIFTS
-from flasher.web.guard import BODY_MAX, application
+from flasher.web.guard import application
 from flasher.web.login import Login
 from flasher.web.pages import Pages
 from flasher.web.query_processes import Answer, Question, answer_routes
 from flasher.web.supervisor import (
-    CHECK,
     PAGES,
+    UPLOADS,
     SupervisorPages,
     open_supervisor,
-    upload_limit,
 )
 
 _KEY = "of the test"
@@ -42,11 +41,11 @@ def app_with(
 
     pages = Pages()
     return application(
-        [*more, *answer_routes(pages, ask, PAGES, [CHECK])],
+        [*more, *answer_routes(pages, ask, PAGES, UPLOADS)],
         hosts={"127.0.0.1"},
         secret=secret,
         login=login,
-        uploads=upload_limit(BODY_MAX),
+        uploads=UPLOADS,
     )
 
 

@@ -26,9 +26,9 @@ from flasher.web.archive import Archive
 from flasher.web.bench import BenchController, Order
 from flasher.web.bench_backend import UpgradeEnding
 from flasher.web.bench_compare import watch_compared
-from flasher.web.bench_page import BenchPage, Shelf, upload_limit
+from flasher.web.bench_page import UPLOADS, BenchPage, Shelf
 from flasher.web.bench_state import Adapter, BenchState
-from flasher.web.guard import BODY_MAX, BrowserEntry, application
+from flasher.web.guard import BrowserEntry, application
 from flasher.web.pages import Pages
 from flasher.web.query_processes import Answer, Question, answer_routes
 from flasher.web.server import Server
@@ -116,7 +116,7 @@ class BenchPlace:
         page = BenchPage(pages, self.bench, self.shelf, is_mock=True)
         app = application(
             [*page.routes, *answer_routes(pages, ask, KEPT)], hosts={"127.0.0.1"},
-            secret=_KEY, entry=entry, uploads=upload_limit(BODY_MAX),
+            secret=_KEY, entry=entry, uploads=UPLOADS,
         )  # fmt: skip
         worker = threading.Thread(target=self.bench.run, args=(watch_compared,), daemon=True)
         with Server(app, "127.0.0.1", 0) as server:

@@ -42,7 +42,7 @@ from flasher.station.records.model import RunFilter, RunKind, RunState, StationC
 from flasher.station.records.store import Store, SystemClock
 from flasher.station.shift_counts import DEFAULT_SHIFTS, ShiftCounts
 from flasher.station.station import Station
-from flasher.web.guard import BODY_MAX, application
+from flasher.web.guard import application
 from flasher.web.login import Badges, Login
 from flasher.web.operator import LINE, CurrentLot, OperatorPage, Screen
 from flasher.web.pages import Pages
@@ -50,12 +50,11 @@ from flasher.web.query_processes import QueryProcesses, answer_routes
 from flasher.web.server import LOOPBACK, Server, Tls
 from flasher.web.sign_ins import Note
 from flasher.web.supervisor import (
-    CHECK,
     PAGES,
+    UPLOADS,
     SupervisorPages,
     place_of,
     serve_supervisor,
-    upload_limit,
 )
 
 _TURN_S: Final = 0.1
@@ -140,7 +139,7 @@ def operator_page(
     view = OperatorView(screen, station, board)
     # Separate processes, so that pages do not slow the station down.
     answering = QueryProcesses(partial(serve_supervisor, *place_of(store), config.shifts))
-    routes = [*operator.routes, *answer_routes(pages, answering.ask, PAGES, [CHECK])]
+    routes = [*operator.routes, *answer_routes(pages, answering.ask, PAGES, UPLOADS)]
     server = served(
         options,
         address,
@@ -194,7 +193,7 @@ def serve(
     async def start(_request: Request) -> Response:
         return RedirectResponse(paths[0], 303)
 
-    routes = [Route("/", start), *answer_routes(shown, answering.ask, paths, [CHECK])]
+    routes = [Route("/", start), *answer_routes(shown, answering.ask, paths, UPLOADS)]
     with (
         closing(answering),
         stop_on_signal() as stopped,
@@ -264,7 +263,7 @@ def served(
         secret=secrets.token_urlsafe(32) if key_locations is None else kept_secret(key_locations),
         login=login,
         is_tls=tls is not None,
-        uploads=upload_limit(BODY_MAX),
+        uploads=UPLOADS,
     )
     with Server(app, address.host, address.port, tls) as server:
         yield server.url

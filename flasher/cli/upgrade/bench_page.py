@@ -45,9 +45,9 @@ from flasher.web.archive import Archive
 from flasher.web.bench import BenchController
 from flasher.web.bench_backend import UpgradeEnding
 from flasher.web.bench_compare import watch_compared
-from flasher.web.bench_page import BenchPage, Shelf, upload_limit
+from flasher.web.bench_page import UPLOADS, BenchPage, Shelf
 from flasher.web.bench_state import Activity, Adapter, Saved
-from flasher.web.guard import BODY_MAX, BrowserEntry, application
+from flasher.web.guard import BrowserEntry, application
 from flasher.web.pages import Pages
 from flasher.web.query_processes import QueryProcesses, answer_routes
 from flasher.web.server import LOOPBACK, Server
@@ -306,7 +306,7 @@ def serve(
             hosts=LOOPBACK,
             secret=secrets.token_urlsafe(32),
             entry=entry,
-            uploads=upload_limit(BODY_MAX),
+            uploads=UPLOADS,
         )
 
         def work() -> None:
