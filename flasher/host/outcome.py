@@ -220,8 +220,8 @@ def ended_before_start(
     )
 
 
-class _Explanation(NamedTuple):
-    """Error class, likely cause and remedy of an ending."""
+class Explanation(NamedTuple):
+    """Error class, likely cause and remedy of an ending or a verdict."""
 
     kind: type[FlasherError]
     cause: str
@@ -235,6 +235,11 @@ class _Explanation(NamedTuple):
         what = text("{node}: {ending}.", node=node, ending=shown)
         if detail:
             what = text("{node}: {ending} ({detail}).", node=node, ending=shown, detail=detail)
+        return self.create(what, target)
+
+    def create(self, what: str, target: Target) -> FlasherError:
+        """Create the error for what happened to a target."""
+        node = target.node.name
         names = {"node": node, "boot_name": target.boot_name, "again": text(AGAIN)}
         cause, remedy = Text(self.cause, names), Text(self.remedy, names)
         return self.kind(what, cause=cause, remedy=remedy, code=self.code)
@@ -251,7 +256,7 @@ TWO_DEVICES_REMEDY: Final = (
     "flash it, then the other one alone."
 )
 _EXPLANATIONS: Final = {
-    Ending.NO_BOOT_VERSION: _Explanation(
+    Ending.NO_BOOT_VERSION: Explanation(
         NoAnswerError,
         "the device has no power, sleeps, is not on this bus, the bit rate differs, or its "
         "bootloader announces itself only at power-up",
@@ -260,7 +265,7 @@ _EXPLANATIONS: Final = {
         "at power-up only is reached by flasher rescue and a power cycle.",
         code=ErrorCode.NO_BOOT_VERSION,
     ),
-    Ending.NO_ANNOUNCEMENT: _Explanation(
+    Ending.NO_ANNOUNCEMENT: Explanation(
         NoAnswerError,
         "it was not switched off and on, it has no power, it is not on this bus, or the bit rate "
         "differs",
@@ -268,60 +273,60 @@ _EXPLANATIONS: Final = {
         "its key or charger); --wait allows more time.",
         code=ErrorCode.NO_ANNOUNCEMENT,
     ),
-    Ending.NO_REQUEST: _Explanation(
+    Ending.NO_REQUEST: Explanation(
         NoAnswerError,
         "erasing takes longer than allowed, or the device refuses this size or target",
         "{again} Power-cycle the device if it stays silent.",
         code=ErrorCode.NO_REQUEST,
     ),
-    Ending.UNHEARING: _Explanation(
+    Ending.UNHEARING: Explanation(
         NoAnswerError,
         "it is not the target device, it refuses this size, or it does not receive",
         "Check that the device is a {node} and that the image fits it.",
         code=ErrorCode.UNHEARING,
     ),
-    Ending.WRONG_DEVICE: _Explanation(
+    Ending.WRONG_DEVICE: Explanation(
         WrongDeviceError,
         "the connected device is not a {node}, whose bootloader reports {boot_name} Vx.x.x",
         "Check -t/--target and what is connected; --allow-boot-name takes the device as it is.",
     ),
-    Ending.BOOT_TOO_OLD: _Explanation(
+    Ending.BOOT_TOO_OLD: Explanation(
         WrongDeviceError,
         "the image's manifest asks for a newer bootloader",
         "Look for an image for this bootloader. --allow-boot-version takes the device as it is.",
         code=ErrorCode.BOOT_TOO_OLD,
     ),
-    Ending.NOT_FOR_DEVICE: _Explanation(
+    Ending.NOT_FOR_DEVICE: Explanation(
         WrongDeviceError,
         "another file was meant, another device is connected, or the manifest is not up to date",
         "Compare the image (flasher image-info) with the device (flasher info).",
         code=ErrorCode.NOT_FOR_DEVICE,
     ),
-    Ending.NOT_TRUSTED: _Explanation(
+    Ending.NOT_TRUSTED: Explanation(
         WrongDeviceError,
         "an older release than the device has received: faults that were mended would come back",
         "Take the newest release of the maker.",
         code=ErrorCode.NOT_TRUSTED,
     ),
-    Ending.IMPLAUSIBLE: _Explanation(
+    Ending.IMPLAUSIBLE: Explanation(
         ImageError,
         LIKELY_CAUSES,
         "Name the firmware file itself; flasher image-info shows what is in a file.",
         code=ErrorCode.IMAGE_IMPLAUSIBLE,
     ),
-    Ending.UNCHECKED: _Explanation(
+    Ending.UNCHECKED: Explanation(
         WrongDeviceError,
         "no application runs on the device, or it has no query for a value of the manifest",
         "Look at the device's label, then waive the check; flasher rescue goes on without it.",
         code=ErrorCode.UNCHECKED,
     ),
-    Ending.IN_USE: _Explanation(
+    Ending.IN_USE: Explanation(
         WrongDeviceError,
         "the bike is being ridden, or a load draws current",
         "Let it stand still and switch its loads off. --allow-in-use upgrades it all the same.",
         code=ErrorCode.VEHICLE_IN_USE,
     ),
-    Ending.LOW_CHARGE: _Explanation(
+    Ending.LOW_CHARGE: Explanation(
         WrongDeviceError,
         "it was used or stored without being charged; an empty battery switches itself off, in the "
         "middle of its upgrade too",
@@ -329,19 +334,19 @@ _EXPLANATIONS: Final = {
         "--allow-low-charge upgrades it all the same.",
         code=ErrorCode.LOW_CHARGE,
     ),
-    Ending.SECOND_TOOL: _Explanation(
+    Ending.SECOND_TOOL: Explanation(
         BusError,
         "another program or dongle speaks as the CAN dongle (CDL) on this bus",
         "End the other tool and disconnect it. {again}",
         code=ErrorCode.SECOND_TOOL,
     ),
-    Ending.TWO_DEVICES: _Explanation(
+    Ending.TWO_DEVICES: Explanation(
         WrongDeviceError,
         TWO_DEVICES_CAUSE,
         "Disconnect one of them. {again}",
         code=ErrorCode.TWO_DEVICES,
     ),
-    Ending.PACKET_FAILED: _Explanation(
+    Ending.PACKET_FAILED: Explanation(
         TransferError,
         "the device lost power or contact, the line is disturbed, or the device cannot store this "
         "packet",
@@ -349,36 +354,36 @@ _EXPLANATIONS: Final = {
         "power cycle.",
         code=ErrorCode.PACKET_FAILED,
     ),
-    Ending.RESTARTED: _Explanation(
+    Ending.RESTARTED: Explanation(
         TransferError,
         "its supply drops, its watchdog resets it, it refuses a packet, or two devices "
         "of the same kind answer",
         "Check the supply, and that there is one {node} only. {again}",
         code=ErrorCode.RESTARTED,
     ),
-    Ending.BROKEN_PROTOCOL: _Explanation(
+    Ending.BROKEN_PROTOCOL: Explanation(
         TransferError,
         "its bootloader does not follow the protocol",
         "Report the boot version to its maker. {again}",
         code=ErrorCode.BROKEN_PROTOCOL,
     ),
-    Ending.REFUSED: _Explanation(
+    Ending.REFUSED: Explanation(
         RefusedError,
         "the image is not meant for this device, or the checksum that it carries is wrong",
         "Look at the image (flasher image-info) and flash one that the device accepts.",
     ),
-    Ending.UNCONFIRMED: _Explanation(
+    Ending.UNCONFIRMED: Explanation(
         UnconfirmedError,
         "the answer was lost, or the device restarted without sending it",
         "Unconfirmed is not complete: check whether the new application runs, or flash again.",
     ),
-    Ending.OTHER_VERSION: _Explanation(
+    Ending.OTHER_VERSION: Explanation(
         VerificationError,
         "the device runs another image than the one sent, or the image names its version wrongly",
         "Compare with flasher image-info, then flash the right image.",
         code=ErrorCode.OTHER_VERSION,
     ),
-    Ending.CANCELLED: _Explanation(
+    Ending.CANCELLED: Explanation(
         InterruptedByUserError,
         "",
         "{again} A bootloader that was receiving may need some seconds to time out first.",
@@ -389,7 +394,7 @@ _NO_SESSION_EITHER: Final = _EXPLANATIONS[Ending.NO_BOOT_VERSION]._replace(
     "by flasher rescue and a power cycle."
 )
 """Explanation for a device that was silent to the update command as well (R26)."""
-_ANSWERED_OTHERWISE: Final = _Explanation(
+_ANSWERED_OTHERWISE: Final = Explanation(
     TransferError,
     "its bootloader numbers packets in another way than table 9 (two bytes, the low one first) or "
     "answers them with another message, or an application runs again",
@@ -397,7 +402,7 @@ _ANSWERED_OTHERWISE: Final = _Explanation(
     code=ErrorCode.PACKET_FAILED,
 )
 _APPLICATION_RUNS: Final = {
-    Ending.NO_BOOT_VERSION: _Explanation(
+    Ending.NO_BOOT_VERSION: Explanation(
         NoAnswerError,
         "its application runs: it ignores the reset in its state, its profile needs another "
         "reset_command, its announcement was lost, or its bootloader announces itself only at "
@@ -405,7 +410,7 @@ _APPLICATION_RUNS: Final = {
         "{again} If it does not help, flasher rescue and a power cycle reach its bootloader.",
         code=ErrorCode.NO_BOOT_VERSION,
     ),
-    Ending.NO_ANNOUNCEMENT: _Explanation(
+    Ending.NO_ANNOUNCEMENT: Explanation(
         NoAnswerError,
         "its application runs: it was not switched off and on, or its bootloader does not announce "
         "itself at power-up",
@@ -416,7 +421,7 @@ _APPLICATION_RUNS: Final = {
 """Explanations for a device whose application sent something shortly before."""
 
 
-_TWO_PERHAPS_ERASED: Final = _Explanation(
+_TWO_PERHAPS_ERASED: Final = Explanation(
     WrongDeviceError, TWO_DEVICES_CAUSE, TWO_DEVICES_REMEDY, code=ErrorCode.TWO_DEVICES
 )
 
@@ -432,24 +437,24 @@ def image_refused(ending: Ending, target: Target, detail: str) -> FlasherError:
     return explained.error(ending, target, detail)
 
 
-def _late(phase: Phase, left: DeviceLeft) -> _Explanation:
+def _late(phase: Phase, left: DeviceLeft) -> Explanation:
     """Explain a missed deadline by the phase that was reached."""
     remedy = "Allow more time with --timeout, or find what is slow. {again}"
     match phase:
         case Phase.LISTEN | Phase.IDENTIFY | Phase.RESET | Phase.BOOT | Phase.UPDATE:
             cause = "the device is not there, or not ready in the time allowed"
-            return _Explanation(NoAnswerError, cause, remedy)
+            return Explanation(NoAnswerError, cause, remedy)
         case Phase.END if left is not DeviceLeft.UNKNOWN:
             cause = "no time was left to send end of transfer"
-            return _Explanation(TransferError, cause, remedy)
+            return Explanation(TransferError, cause, remedy)
         case Phase.TRANSFER:
             cause = (
                 "the device lost power or contact, it answers late again and again, or the bus is "
                 "congested"
             )
-            return _Explanation(TransferError, cause, remedy)
+            return Explanation(TransferError, cause, remedy)
         case Phase.END | Phase.CONFIRM:
             cause = "the final answer did not come in the time allowed"
-            return _Explanation(UnconfirmedError, cause, remedy)
+            return Explanation(UnconfirmedError, cause, remedy)
         case _:
             assert_never(phase)

@@ -27,6 +27,7 @@ from flasher.host.outcome import (
     TWO_DEVICES_CAUSE,
     TWO_DEVICES_REMEDY,
     DeviceLeft,
+    Explanation,
     with_device_state,
 )
 from flasher.host.query import READ_MEMORY, Query, ask, count_answers, memory_bytes, memory_requests
@@ -84,6 +85,52 @@ GOOD: Final = frozenset(
 )
 
 
+_OTHER_IMAGE: Final = Explanation(
+    VerificationError,
+    "the device runs another image, or fell back to an older one",
+    "Power-cycle the device and look at it with flasher info; then flash the right image.",
+)
+_EXPLANATIONS: Final = {
+    Verdict.INTERRUPTED: Explanation(
+        InterruptedByUserError, "", "Show its version with flasher info."
+    ),
+    Verdict.TWO_DEVICES: Explanation(
+        WrongDeviceError, TWO_DEVICES_CAUSE, TWO_DEVICES_REMEDY, code=ErrorCode.TWO_DEVICES
+    ),
+    Verdict.OTHER_UNIT: Explanation(
+        WrongDeviceError,
+        "the unit was exchanged during the upgrade, or the new firmware reports "
+        "another serial number",
+        "One unit has the new image, and the other one perhaps not: connect one "
+        "alone, look at it with flasher info, then at the other one.",
+        code=ErrorCode.OTHER_UNIT,
+    ),
+    Verdict.SECOND_TOOL: Explanation(
+        BusError,
+        "another program or dongle speaks as the CAN dongle (CDL) on this bus",
+        "End the other tool, then look at the device with flasher info.",
+        code=ErrorCode.SECOND_TOOL,
+    ),
+    Verdict.IN_BOOTLOADER: Explanation(
+        VerificationError,
+        "the device does not start the image that it confirmed, or a second device "
+        "of its kind has lost its application",
+        "Leave one {node} alone on the bus, then flash it again.",
+        code=ErrorCode.IN_BOOTLOADER,
+    ),
+    Verdict.NO_ANSWER: Explanation(
+        VerificationError,
+        "the application starts slowly (application_start_timeout_s of a profile), does "
+        "not know the query, or does not start",
+        "Look at the device with flasher info; if it does not answer, power-cycle it and "
+        "look again, then flash it again.",
+    ),
+    Verdict.VERSION_OTHER: _OTHER_IMAGE._replace(code=ErrorCode.OTHER_VERSION),
+    Verdict.MEMORY_OTHER: _OTHER_IMAGE,
+}
+"""Errors of an upgrade by the verdict of its verification."""
+
+
 @dataclass(frozen=True)
 class Verification:
     """Level and verdict of a verification, and the reported firmware version (escaped)."""
@@ -118,8 +165,11 @@ class Verification:
         what = f"{target.node.name}: {ending}"
         what += f" ({self.detail})." if self.detail else "."
         if is_after_upgrade or self.verdict in (Verdict.TWO_DEVICES, Verdict.SECOND_TOOL):
-            error = self._error(target, what)
+            error = _EXPLANATIONS[self.verdict].create(what, target)
             error.needs_rescue = self.device_left.needs_rescue
+            is_named = self.verdict in (Verdict.TWO_DEVICES, Verdict.OTHER_UNIT)
+            if self.verdict is Verdict.INTERRUPTED or (error.needs_rescue and not is_named):
+                error.remedy = with_device_state(error.remedy, self.device_left)
         else:
             error = self._error_of_comparison(target, what)
         error.where = f"verification by {self.level.value}"
@@ -152,75 +202,6 @@ class Verification:
             "flasher image-info shows what is in an image.",
             code=ErrorCode.OTHER_VERSION if is_other else None,
         )
-
-    def _error(self, target: Target, what: str) -> FlasherError:
-        if self.verdict is Verdict.INTERRUPTED:
-            return InterruptedByUserError(
-                what,
-                remedy=self._with_state("Show its version with flasher info."),
-            )
-        if self.verdict is Verdict.TWO_DEVICES:
-            return WrongDeviceError(
-                what,
-                cause=TWO_DEVICES_CAUSE,
-                remedy=TWO_DEVICES_REMEDY,
-                code=ErrorCode.TWO_DEVICES,
-            )
-        if self.verdict is Verdict.OTHER_UNIT:
-            return WrongDeviceError(
-                what,
-                cause="the unit was exchanged during the upgrade, or the new firmware reports "
-                "another serial number",
-                remedy="One unit has the new image, and the other one perhaps not: connect one "
-                "alone, look at it with flasher info, then at the other one.",
-                code=ErrorCode.OTHER_UNIT,
-            )
-        if self.verdict is Verdict.SECOND_TOOL:
-            return BusError(
-                what,
-                cause="another program or dongle speaks as the CAN dongle (CDL) on this bus",
-                remedy=self._with_state(
-                    "End the other tool, then look at the device with flasher info."
-                ),
-                code=ErrorCode.SECOND_TOOL,
-            )
-        if self.verdict is Verdict.IN_BOOTLOADER:
-            return VerificationError(
-                what,
-                cause="the device does not start the image that it confirmed, or a second device "
-                "of its kind has lost its application",
-                remedy=self._with_state(
-                    text(
-                        "Leave one {node} alone on the bus, then flash it again.",
-                        node=target.node.name,
-                    )
-                ),
-                code=ErrorCode.IN_BOOTLOADER,
-            )
-        cause = "the device runs another image, or fell back to an older one"
-        remedy = (
-            "Power-cycle the device and look at it with flasher info; then flash the right image."
-        )
-        if self.verdict is Verdict.NO_ANSWER:
-            cause = (
-                "the application starts slowly (application_start_timeout_s of a profile), does "
-                "not know the query, or does not start"
-            )
-            remedy = (
-                "Look at the device with flasher info; if it does not answer, power-cycle it and "
-                "look again, then flash it again."
-            )
-        if self.device_left.needs_rescue:
-            remedy = self._with_state(remedy)
-        return VerificationError(
-            what,
-            cause=cause,
-            remedy=remedy,
-            code=ErrorCode.OTHER_VERSION if self.verdict is Verdict.VERSION_OTHER else None,
-        )
-
-    def _with_state(self, remedy: str) -> str:
-        return with_device_state(remedy, self.device_left)
 
 
 NOT_ASKED: Final = Verification(Level.NONE, Verdict.NOT_ASKED)
