@@ -3,29 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-from flasher.image.image import Image
-from flasher.image.release import Release
 from flasher.protocol.spec import Target
 from flasher.release.container import IMAGES, LOG, NOTES, SBOM, STATEMENT, TRUST, pack
 from flasher.release.envelope import Envelope, json_bytes
 from flasher.release.keys import SigningKey
-from flasher.release.statement import PAYLOAD_TYPE, statement_bytes
+from flasher.release.statement import PAYLOAD_TYPE, Part, statement_bytes
 from flasher.release.transparency import ReleaseLog
 from flasher.release.trust import Chain
 from flasher.release.verify import Package
-
-
-@dataclass(frozen=True)
-class Part:
-    """Image of a release: its file, and its manifest."""
-
-    name: str
-    """File name in the container."""
-    content: bytes
-    image: Image
-    release: Release
 
 
 def build(
@@ -40,13 +27,10 @@ def build(
     is_detached: bool = False,
 ) -> tuple[bytes, ReleaseLog | None]:
     """Return a release without signatures, and the log with it appended."""
-    files = {IMAGES + each.name: each.content for each in parts.values()}
+    files = {each.file: each.content for each in parts.values()}
     files |= {NOTES: notes} if notes is not None else {}
     files |= {SBOM: sbom} if sbom is not None else {}
-    images = {
-        target: (IMAGES + part.name, part.image, part.release) for target, part in parts.items()
-    }
-    envelope = Envelope(statement_bytes(files, images, released=released), PAYLOAD_TYPE)
+    envelope = Envelope(statement_bytes(files, parts, released=released), PAYLOAD_TYPE)
     if log is not None:
         log = log.append(envelope.payload, log_keys)
     members = {

@@ -20,8 +20,8 @@ from flasher.protocol.spec import Target
 from flasher.release.container import IMAGES, damaged
 from flasher.release.envelope import json_bytes
 from flasher.release.trust import DateText
-from flasher.settings.manifest import STATEMENTS
 from flasher.settings.manifest import reader as manifest_reader
+from flasher.settings.manifest import stated_keys
 from flasher.validation import Parsed, json_keys
 
 if TYPE_CHECKING:
@@ -103,15 +103,27 @@ def _reader() -> Reader[_Statement]:
     return Reader(_Statement, "statement of a release", error=ImageError)
 
 
+@dataclass(frozen=True)
+class Part:
+    """Image of a release that is built: its file, and its manifest."""
+
+    name: str
+    content: bytes
+    image: Image
+    release: Release
+
+    @property
+    def file(self) -> str:
+        """Name of the file in the container."""
+        return IMAGES + self.name
+
+
 def statement_bytes(
-    files: Mapping[str, bytes],
-    images: Mapping[Target, tuple[str, Image, Release]],
-    *,
-    released: str,
+    files: Mapping[str, bytes], parts: Mapping[Target, Part], *, released: str
 ) -> bytes:
     """Write the statement of files and images, in the one form that is signed."""
     hashes = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
-    hashes |= {f"{target.name}{_SENT}": image.sha256 for target, (_, image, _) in images.items()}
+    hashes |= {f"{target.name}{_SENT}": part.image.sha256 for target, part in parts.items()}
     return json_bytes(
         {
             "_type": STATEMENT_TYPE,
@@ -122,25 +134,12 @@ def statement_bytes(
             "predicate": {
                 "released": released,
                 "images": [
-                    {"file": name, "manifest": _manifest(release)}
-                    for target, (name, _, release) in sorted(images.items(), key=_by_name)
+                    {"file": part.file, "manifest": stated_keys(part.release)}
+                    for _, part in sorted(parts.items(), key=lambda item: item[0].name)
                 ],
             },
         }
     )
-
-
-def _by_name(item: tuple[Target, object]) -> str:
-    return item[0].name
-
-
-def _manifest(release: Release) -> dict[str, Any]:
-    values = {key: getattr(release, key) for key in STATEMENTS}
-    return {
-        key: value.name if isinstance(value, Target) else value
-        for key, value in values.items()
-        if value not in (None, (), "")
-    }
 
 
 def parse_statement(payload: bytes, source: str) -> Statement:

@@ -150,11 +150,16 @@ def release_of(
     return release
 
 
+def stated_keys(release: Release) -> dict[str, Any]:
+    """Return the keys of a manifest with their values, without unset ones."""
+    values = {key: getattr(release, key) for key in STATEMENTS}
+    return {
+        key: value.name if isinstance(value, Target) else value
+        for key, value in values.items()
+        if value not in (None, (), "")
+    }
+
+
 def to_toml(release: Release) -> str:
     """Format a manifest, without unset values."""
-    values: dict[str, Any] = {FORMAT_KEY: FORMAT_VERSION}
-    for key in STATEMENTS:
-        value = getattr(release, key)
-        if value not in (None, (), ""):
-            values[key] = value.name if isinstance(value, Target) else value
-    return tomli_w.dumps(values)
+    return tomli_w.dumps({FORMAT_KEY: FORMAT_VERSION, **stated_keys(release)})

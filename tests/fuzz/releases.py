@@ -9,7 +9,8 @@ from flasher.errors import ImageError
 from flasher.image.image import Image
 from flasher.protocol.spec import BMS
 from flasher.release import container, verify
-from flasher.release.build import Part, build
+from flasher.release.build import build
+from flasher.release.statement import Part
 from flasher.release.transparency import ReleaseLog
 from flasher.settings.manifest import release_of
 from tests.fuzz.harness import Harness

@@ -20,8 +20,9 @@ from flasher.image.image import Image  # noqa: E402
 from flasher.image.load import load  # noqa: E402
 from flasher.protocol.spec import BMS, Target  # noqa: E402
 from flasher.release import container, verify  # noqa: E402
-from flasher.release.build import Part, build, with_signatures  # noqa: E402
+from flasher.release.build import build, with_signatures  # noqa: E402
 from flasher.release.keys import PublicKey, SigningKey  # noqa: E402
+from flasher.release.statement import Part  # noqa: E402
 from flasher.release.store import TrustStore  # noqa: E402
 from flasher.release.transparency import ReleaseLog  # noqa: E402
 from flasher.release.trust import Chain, Role, Trust, TrustedKey, new_chain  # noqa: E402

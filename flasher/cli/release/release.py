@@ -35,10 +35,11 @@ from flasher.image.release import Release, check_target
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
 from flasher.release import container, verify
-from flasher.release.build import Part, build, with_signature, with_signatures
+from flasher.release.build import build, with_signature, with_signatures
 from flasher.release.envelope import Envelope
 from flasher.release.keys import PublicKey, read_public_key
 from flasher.release.places import SUFFIX, detached_path
+from flasher.release.statement import Part
 from flasher.release.transparency import LOG_MAX_SIZE, ReleaseLog, parse_log
 from flasher.release.trust import CHAIN_MAX_SIZE, Chain, parse_chain
 from flasher.settings.manifest import check_statement, find_release, release_of
