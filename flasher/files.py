@@ -247,6 +247,20 @@ def part_of(path: Path, *, left_s: float = 0.0) -> Path:
     return path.with_name(f".{path.name}-{token_hex(4)}.part")
 
 
+def replace_private(path: Path, data: bytes) -> None:
+    """Replace a file as a whole by one that only its owner may read; a lock keeps others away.
+    Raises OSError.
+    """
+    part = part_of(path)
+    try:
+        with open(part, "xb", opener=owner_only) as file:
+            file.write(data)
+        part.replace(path)
+    finally:  # an interrupt leaves no part either
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
 def make_private(path: str | os.PathLike[str], *, is_appended_to: bool = False) -> None:
     """Create a file readable only by its owner, to be opened by name. An existing one is emptied,
     unless it `is_appended_to`, and loses the permissions of others. Pipes and devices are not

@@ -25,7 +25,7 @@ from platformdirs import user_data_path
 
 from flasher.errors import UsageError, printable
 from flasher.events import Phase
-from flasher.files import opened, owner_only, part_of
+from flasher.files import opened, owner_only, replace_private
 from flasher.i18n import text
 from flasher.wording import wording_of
 
@@ -297,15 +297,7 @@ class FlashHistory:
 
     def _drop_older_half(self) -> None:
         lines = self._lines(SIZE_MAX // 2)
-        part = part_of(self.path)
-        try:
-            with open(part, "xb", opener=owner_only) as file:
-                file.writelines(b"%s\n" % each for each in lines)
-            part.replace(self.path)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                part.unlink(missing_ok=True)
-            raise
+        replace_private(self.path, b"".join(b"%s\n" % each for each in lines))
         kept = b"".join(lines)
         for path in self._folder.glob("*"):
             if path.stem.encode() not in kept and not self._is_running(path.stem):

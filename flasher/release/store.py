@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 from filelock import FileLock, Timeout
 
 from flasher.errors import ErrorCode, FlasherError, UsageError
-from flasher.files import make_private, parse_json, part_of, read
+from flasher.files import parse_json, read, replace_private
 from flasher.i18n import text
 from flasher.protocol.text import printable
 from flasher.release.envelope import json_bytes
@@ -157,7 +157,7 @@ class TrustStore:
             if chain.newest.version > known.trust.version:
                 self._write_chain(chain)
             if seen != known.seen:
-                self._write(self._note(chain), json_bytes(vars(seen)))
+                replace_private(self._note(chain), json_bytes(vars(seen)))
         return Known(chain, seen)
 
     def install(self, chain: Chain, *, replaces: bool = False) -> Known:
@@ -179,13 +179,14 @@ class TrustStore:
                 version=max(seen.version, chain.newest.version),
                 newest_date=max(seen.newest_date, chain.newest.issued),
             )
-            self._write(self._note(chain), json_bytes(vars(seen)))
+            replace_private(self._note(chain), json_bytes(vars(seen)))
         return Known(chain, seen)
 
     def _write_chain(self, chain: Chain) -> None:
         # In this order: a trust file may be an older version of its chain.
-        self._write(self.path.with_name(CHAIN_FILE), chain.to_bytes())
-        self._write(self.path, chain.envelopes[-1].payload)
+        self.path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        replace_private(self.path.with_name(CHAIN_FILE), chain.to_bytes())
+        replace_private(self.path, chain.envelopes[-1].payload)
 
     def _note(self, chain: Chain) -> Path:
         return self._seen / f"{chain.anchor[:32]}.json"
@@ -215,16 +216,6 @@ class TrustStore:
                 remedy=text("Make the folder writable for this user, and room on the disk."),
                 code=ErrorCode.FILE_NOT_WRITTEN,
             ) from error
-
-    def _write(self, path: Path, data: bytes) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        part = part_of(path)
-        try:
-            make_private(part)
-            part.write_bytes(data)
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
 
 
 def _newest(one: Seen, other: Seen) -> Seen:
