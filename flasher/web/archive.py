@@ -10,7 +10,6 @@ import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
-from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -23,7 +22,7 @@ from flasher.report.explain_page import story_context
 from flasher.trace.bundle import bundles
 from flasher.trace.source import explain_path, recorded_of
 from flasher.translation import translator
-from flasher.web.pages import Pages
+from flasher.web.pages import page_text
 from flasher.web.query_processes import HTML, Answer, Question
 
 SHOWN_MAX: Final = 50
@@ -51,10 +50,6 @@ class Archive:
     backups: Path
     traces: Path
 
-    @cached_property
-    def _pages(self) -> Pages:
-        return Pages()
-
     def answer(self, question: Question) -> Answer:
         """Render a page or return a file; an error page if there is none."""
         try:
@@ -70,7 +65,7 @@ class Archive:
     def _page(
         self, question: Question, template: str, *, http: int = 200, **context: Any
     ) -> Answer:
-        text = self._pages.text(
+        text = page_text(
             template,
             translator(question.language),
             question.token,

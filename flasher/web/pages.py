@@ -41,6 +41,12 @@ def _environment(language: str) -> Environment:
     return environment(loader, translator(language))
 
 
+def page_text(template: str, translate: Translator, token: str, **context: Any) -> str:
+    """Render a page. Templates also get `token`, `languages` and `version`."""
+    page = _environment(translate.code).get_template(template)
+    return page.render(languages=NAMES, token=token, version=__version__, **context)
+
+
 class Pages:
     """Renders pages. `language`: the default; None: the browser's. With `remembers_language`, a
     chosen language is stored in the session.
@@ -73,18 +79,5 @@ class Pages:
         token = request.session.get("token", "")
         context.setdefault("sign_in", request.scope.get("sign_in"))
         return HTMLResponse(
-            self.text(template, self.translator_of(request), token, **context), status
-        )
-
-    def text(self, template: str, translate: Translator, token: str, **context: Any) -> str:
-        """Render a page. Templates also get `token`, `languages` and `version`."""
-        return (
-            _environment(translate.code)
-            .get_template(template)
-            .render(
-                languages=NAMES,
-                token=token,
-                version=__version__,
-                **context,
-            )
+            page_text(template, self.translator_of(request), token, **context), status
         )

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, time, timedelta
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from pathlib import Path
 from threading import Thread
@@ -65,7 +65,7 @@ from flasher.trace.figures import Distribution
 from flasher.trace.story import Story
 from flasher.translation import Translator, translator
 from flasher.web.charts import SERIES_MAX, lines, stacked_bars
-from flasher.web.pages import Pages
+from flasher.web.pages import page_text
 from flasher.web.query_processes import RUN, Answer, Question
 
 USUAL_DAYS: Final = 30
@@ -137,10 +137,6 @@ class SupervisorPages:
     def overview(self) -> Overview:
         return Overview(self.store.database)
 
-    @cached_property
-    def _pages(self) -> Pages:
-        return Pages()
-
     def answer(self, question: Question) -> Answer:
         """Render a page; an error page if there is none."""
         try:
@@ -170,7 +166,7 @@ class SupervisorPages:
     ) -> Answer:
         translate = translator(question.language)
         shown = frame(question, self.now(), self.names) | context
-        text = self._pages.text(template, translate, question.token, outcomes=RUN_WORDS, **shown)
+        text = page_text(template, translate, question.token, outcomes=RUN_WORDS, **shown)
         return Answer(text.encode("utf-8", "backslashreplace"), status=http)
 
     # -- runs -------------------------------------------------------------------------------------
@@ -494,29 +490,20 @@ def open_supervisor(
     shifts: Sequence[time],
     kind: type[Store] = Store,
     make: Callable[[Store, Sequence[time]], SupervisorPages] = SupervisorPages,
+    *,
+    keeps_sums: bool = False,
 ) -> SupervisorPages:
-    """Open records read-only. Raises as `Store.open`."""
+    """Open records read-only. With `keeps_sums`, the daily sums are updated while this process
+    runs. Raises as `Store.open`.
+    """
     store = kind.open(
         url, station="pages", folder=folder, read_only=True, key_locations=key_locations
     )
+    if keeps_sums:
+        work = Rollup(store.database).keep_up
+        now = partial(datetime.now, UTC)
+        Thread(target=work, args=(now, sleep), name="sums", daemon=True).start()
     return make(store, shifts)
-
-
-def serve_supervisor(
-    url: str,
-    folder: Path,
-    key_locations: KeyLocations,
-    shifts: Sequence[time],
-    kind: type[Store] = Store,
-    make: Callable[[Store, Sequence[time]], SupervisorPages] = SupervisorPages,
-) -> SupervisorPages:
-    """Open records read-only, and update the daily sums while this process runs."""
-    supervisor = open_supervisor(url, folder, key_locations, shifts, kind, make)
-    rollup = Rollup(supervisor.store.database)
-    Thread(
-        target=rollup.keep_up, args=(lambda: datetime.now(UTC), sleep), name="sums", daemon=True
-    ).start()
-    return supervisor
 
 
 PAGES: Final[Mapping[str, Callable[[SupervisorPages, Question], Answer]]] = {

@@ -45,7 +45,7 @@ from flasher.station.records.store import Store
 from flasher.station.reports import Report
 from flasher.station.shift_counts import DEFAULT_SHIFTS
 from flasher.web.query_processes import RUN, QueryProcesses, Question
-from flasher.web.supervisor import PAGES, open_supervisor, place_of, serve_supervisor
+from flasher.web.supervisor import PAGES, open_supervisor, place_of
 from tests.benchmarks import bulk_records
 from tests.benchmarks.bulk_records import FIRST_DAY, RUNS_A_DAY
 from tests.station.factory import BMS_VERSION, IMAGES, USUAL, Bench, FakeClock, make_recipe
@@ -257,7 +257,9 @@ def measure_station(plant: Plant) -> None:
     store = plant.open(read_only=False, clock=clock)
     store.recover()
     print(f"  a station starts, cold {(time.perf_counter() - began) * 1000:7.0f} ms")
-    answering = QueryProcesses(partial(serve_supervisor, *place_of(store), DEFAULT_SHIFTS))
+    answering = QueryProcesses(
+        partial(open_supervisor, *place_of(store), DEFAULT_SHIFTS, keeps_sums=True)
+    )
     with closing(store), closing(answering):
         _runs(store, clock, recipe, plant.folder)
         _commits(store, "alone")

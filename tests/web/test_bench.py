@@ -44,7 +44,7 @@ from flasher.web.bench_backup import back_up, find_areas
 from flasher.web.bench_page import as_it_is_now, battery_answers, facts
 from flasher.web.bench_state import Activity, BenchState, Done
 from flasher.web.bench_watch import watch
-from flasher.web.pages import Pages
+from flasher.web.pages import page_text
 from flasher.web.virtual_bike import BikeFault
 from tests.end_to_end.stage import NEW, OLD, image_of
 from tests.loops import each
@@ -365,7 +365,7 @@ def test_time_in_which_the_adapter_was_away_is_a_claim_of_its_own(
     away = replace(done.result, outcome=replace(done.result.outcome, unobserved_s=1.5))
     translate = translator(language)
     for shown, is_shown in ((done, False), (replace(done, result=away), True)):
-        sheet = Pages(language).text(
+        sheet = page_text(
             "bench_sheet.html",
             translate,
             "",

@@ -53,8 +53,8 @@ from flasher.web.supervisor import (
     PAGES,
     UPLOADS,
     SupervisorPages,
+    open_supervisor,
     place_of,
-    serve_supervisor,
 )
 
 _TURN_S: Final = 0.1
@@ -138,7 +138,9 @@ def operator_page(
     operator = OperatorPage(pages, screen.feed, station.submit, sound_volume=config.sound_volume)
     view = OperatorView(screen, station, board)
     # Separate processes, so that pages do not slow the station down.
-    answering = QueryProcesses(partial(serve_supervisor, *place_of(store), config.shifts))
+    answering = QueryProcesses(
+        partial(open_supervisor, *place_of(store), config.shifts, keeps_sums=True)
+    )
     routes = [*operator.routes, *answer_routes(pages, answering.ask, PAGES, UPLOADS)]
     server = served(
         options,
@@ -188,7 +190,9 @@ def serve(
     with closing(open_to_read(records, kind)) as store:  # fails before the pages are served
         place = place_of(store)
     shown = Pages(pages.language)
-    answering = QueryProcesses(partial(serve_supervisor, *place, shifts, kind, make))
+    answering = QueryProcesses(
+        partial(open_supervisor, *place, shifts, kind, make, keeps_sums=True)
+    )
 
     async def start(_request: Request) -> Response:
         return RedirectResponse(paths[0], 303)
