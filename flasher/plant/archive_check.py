@@ -173,7 +173,7 @@ class ArchiveExaminer(AssembledExaminer):
         shown = printable(self._path.name)
         trails = {
             station: ExaminedTrail(
-                each.name, each.first - 1, each.previous_hash, keys=list(each.keys)
+                each.first - 1, each.previous_hash, keys=list(each.keys), station=each.name
             )
             for station, each in self._chains.items()
         }

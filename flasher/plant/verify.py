@@ -215,13 +215,14 @@ def _begun(connection: Connection, station: UUID) -> tuple[ExaminedTrail, str]:
     """The chain's station and records, as its first row states them, or its part in files."""
     retired = last_archived(connection, station)
     if retired.last:
-        keys = list(retired.keys)
-        return ExaminedTrail(
-            retired.name, retired.last, retired.hash, keys=keys
-        ), retired.records_id
+        trail = ExaminedTrail(
+            retired.last, retired.hash, keys=list(retired.keys), station=retired.name
+        )
+        return trail, retired.records_id
     query = select(chain_row.c.data).where(chain_row.c.station == station, chain_row.c.number == 1)
     data = chain.data_of(connection.execute(query).scalar_one_or_none() or "")
-    return ExaminedTrail(str(data.get("station", station))), str(data.get("records", ""))
+    trail = ExaminedTrail(station=str(data.get("station", station)))
+    return trail, str(data.get("records", ""))
 
 
 def _station_of(records_id: str, name: str) -> UUID:

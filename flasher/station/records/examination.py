@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from copy import deepcopy
 from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Final
@@ -60,29 +61,19 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass
-class ExaminedTrail:
-    """One station's chain while it is examined."""
+class ExaminedTrail(ExaminedChain):
+    """One station's chain while it is examined. `rows` and `hash` are those that an earlier
+    examination covered; the rest is that of all rows so far.
+    """
 
-    station: str
-    begin: int = 0
-    """Last row that an earlier examination covered."""
-    before: str = chain.GENESIS
-    """Hash of that row."""
+    station: str = field(kw_only=True)
     hashes: bytearray = field(default_factory=bytearray)
     """Hashes of later rows, packed as bytes: a plant has millions."""
-    restored: dict[int, range] = field(default_factory=dict)
-    """Ranges of lost rows, by the number of the RESTORED row that accepts them."""
-    keys: list[str] = field(default_factory=list)
-    """Public keys so far; the last one signs the next row."""
-    stated: tuple[int | None, Mapping[str, str]] = (None, {})
-    """Schema version and schema that the chain last recorded."""
-    first: dict[str, int] = field(default_factory=dict)
-    """First row whose head is stored in a place, by place."""
 
     @property
     def end(self) -> int:
         """Number of the last row."""
-        return self.begin + len(self.hashes) // _HASH_BYTES
+        return self.rows + len(self.hashes) // _HASH_BYTES
 
     def add(self, row_hash: str) -> None:
         try:
@@ -93,8 +84,8 @@ class ExaminedTrail:
 
     def hash_of(self, number: int) -> str | None:
         """Hash of a row; None if this examination did not read it."""
-        at = number - self.begin
-        if not 1 <= at <= self.end - self.begin:
+        at = number - self.rows
+        if not 1 <= at <= self.end - self.rows:
             return None
         return self.hashes[(at - 1) * _HASH_BYTES : at * _HASH_BYTES].hex()
 
@@ -215,20 +206,12 @@ class Examiner:
         run = schema.run.c
         last, count = connection.execute(select(func.max(run.id), func.count(run.id))).one()
         running = select(run.id).where(run.state == RunState.RUNNING.value)
-        chains = {
-            each.station: ExaminedChain(
-                each.end,
-                chain.hash_at(connection, each.station, each.end) or "",
-                each.keys[-1],
-                tuple(each.keys),
-                {number: (lost.start, lost.stop - 1) for number, lost in each.restored.items()},
-                each.stated[0],
-                dict(each.stated[1]),
-                each.first,
-            )
-            for each in self._trails_found
-            if each.end
-        }
+        chains = {}
+        for each in filter(lambda trail: trail.end, self._trails_found):
+            known = {name: getattr(each, name) for name in ExaminedChain.__dataclass_fields__}
+            last_hash = chain.hash_at(connection, each.station, each.end) or ""
+            known |= {"rows": each.end, "hash": last_hash, "key": each.keys[-1]}
+            chains[each.station] = ExaminedChain(**known)
         return Examined(
             utc_text(now),
             records_id,
@@ -290,7 +273,7 @@ class Examiner:
         # The hash of the last examined row covers all rows before it.
         begin = last if first else next(e for e in heads.entries() if isinstance(e, ChainHead))
         for head in (begin, last):
-            if head.number <= trail.begin:
+            if head.number <= trail.rows:
                 if chain.hash_at(connection, trail.station, head.number) == head.hash:
                     first, end = first or head.number, max(end, head.number)
                 else:
@@ -298,14 +281,14 @@ class Examiner:
         accepted_at: dict[int, int] = {}
         is_younger = False
         """True after the last head that existed before the records were read."""
-        for index, entry in enumerate(heads.entries(after=trail.begin)):
+        for index, entry in enumerate(heads.entries(after=trail.rows)):
             if not isinstance(entry, ChainHead):
                 yield from _segment_faults(trail, place, entry)
             elif trail.hash_of(entry.number) == entry.hash:
                 first, end = first or entry.number, max(end, entry.number)
                 if entry.number in trail.restored:
                     accepted_at[entry.number] = index
-            elif entry.number > trail.begin and not is_younger:
+            elif entry.number > trail.rows and not is_younger:
                 wrong.append((index, entry))
             is_younger = is_younger or entry == last
         held = _without_accepted(trail, wrong, accepted_at)
@@ -329,7 +312,7 @@ class Examiner:
         others = [name for each in kept for name in each.lasts]
         for name in dict.fromkeys([*names, *others]):
             trail = _continued_trail(name, self._since)
-            query = chain.rows_after(name, trail.begin).execution_options(yield_per=1000)
+            query = chain.rows_after(name, trail.rows).execution_options(yield_per=1000)
             self._trails_found.append(trail)
             with connection.execute(query) as rows:
                 yield from self._chain(trail, rows.mappings(), records_id)
@@ -339,7 +322,7 @@ class Examiner:
                 kept.is_elsewhere and kept.station == name for kept in self._kept
             ):
                 self._unkept.append(name)
-        stated = [each.stated for each in self._trails_found if each.end]
+        stated = [(each.version, each.schema) for each in self._trails_found if each.end]
         for thing, what in stated_differences(stated, found):
             yield Problem(f"schema, {printable(thing)}", what)
 
@@ -353,7 +336,7 @@ class Examiner:
         `trail`.
         """
         key = trail.keys[-1] if trail.keys else ""
-        end = chain.ChainEnd(trail.end, trail.hash_of(trail.end) or trail.before, key)
+        end = chain.ChainEnd(trail.end, trail.hash_of(trail.end) or trail.hash, key)
         shown = printable(trail.station)
         for expected, row in enumerate(rows, trail.end + 1):
             where = f"audit row {expected} of {shown}"
@@ -368,9 +351,10 @@ class Examiner:
             if chain.RowFault.CHANGED in faults:
                 continue  # its content is not trusted
             if _table(data.get("schema")):
-                trail.stated = data.get("version"), _table(data.get("schema"))
+                trail.version, trail.schema = data.get("version"), data["schema"]
             if row["event"] in chain.LOSSES:
-                trail.restored[expected] = chain.lost_of(data)
+                lost = chain.lost_of(data)
+                trail.restored[expected] = lost.start, lost.stop - 1
             self._add_remarks(shown, row, data)
             for what in _contradictions(trail.station, records_id, row["event"], data):
                 yield Problem(where, what)
@@ -569,14 +553,7 @@ def _is_as_examined(connection: Connection, since: Examined) -> bool:
 def _continued_trail(name: str, since: Examined | None) -> ExaminedTrail:
     """The state of a station's chain at the end of the last examination."""
     each = None if since is None else since.chains.get(name)
-    if each is None:
-        return ExaminedTrail(name)
-    restored = {number: range(first, last + 1) for number, (first, last) in each.restored.items()}
-    stated = (each.version, each.schema)
-    return ExaminedTrail(
-        name, each.rows, each.hash, restored=restored, keys=list(each.keys), stated=stated,
-        first=dict(each.first),
-    )  # fmt: skip
+    return ExaminedTrail(**vars(deepcopy(each or ExaminedChain())), station=name)
 
 
 def _row_faults(connection: Connection, row: Mapping[Any, Any]) -> Iterator[str]:
@@ -697,8 +674,8 @@ def _without_accepted(
         head
         for index, head in wrong
         if not any(
-            head.number in lost and index < accepted_at.get(number, index + 1)
-            for number, lost in trail.restored.items()
+            first <= head.number <= last and index < accepted_at.get(number, index + 1)
+            for number, (first, last) in trail.restored.items()
         )
     ]
 

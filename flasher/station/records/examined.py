@@ -13,6 +13,7 @@ from typing import Any, Final
 from pydantic import TypeAdapter, ValidationError
 
 from flasher.files import parse_json, read
+from flasher.station.records.chain import GENESIS
 from flasher.station.records.errors import RecordError, mapped
 from flasher.station.records.files import whole_file
 from flasher.station.records.signatures import EXAMINED, SigningKey, is_signed
@@ -21,23 +22,23 @@ _MAX_SIZE: Final = 6 * 1024 * 1024
 """In bytes."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class ExaminedChain:
     """One station's chain up to the last row that was examined."""
 
-    rows: int
-    hash: str
+    rows: int = 0
+    hash: str = GENESIS
     """Hash of the last row."""
-    key: str
+    key: str = ""
     """Public key with which the next row is signed."""
-    keys: tuple[str, ...]
+    keys: list[str] = field(default_factory=list)
     """All public keys of the rows."""
-    restored: dict[int, tuple[int, int]]
+    restored: dict[int, tuple[int, int]] = field(default_factory=dict)
     """First and last lost row, by the RESTORED row that accepts them."""
-    version: int | None
-    schema: dict[str, str]
+    version: int | None = None
+    schema: dict[str, str] = field(default_factory=dict)
     """The schema that the chain recorded last."""
-    first: dict[str, int]
+    first: dict[str, int] = field(default_factory=dict)
     """First row whose head is stored in a place, by place."""
 
 
