@@ -21,7 +21,7 @@ from http.client import HTTP_PORT, HTTPS_PORT, HTTPConnection, HTTPException
 from typing import Any, Final, Literal
 from urllib.parse import urlencode, urlsplit
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from flasher import __version__
 from flasher.errors import UsageError
@@ -152,10 +152,22 @@ class Question:
         data = response.read(REPLY_MAX_SIZE + 1)
         if len(data) > REPLY_MAX_SIZE:
             raise _NoAnswerError(f"the reply has more than {REPLY_MAX_SIZE:,} bytes")
+        if response.length:
+            raise _NoAnswerError("the reply is not complete")
         try:
-            return _REPLY.validate_json(data)
-        except ValidationError as error:
+            reply = _REPLY.validate_json(data)
+            json.loads(data, object_pairs_hook=_named_once)
+        except ValueError as error:
             raise _NoAnswerError('the reply is not {"answer": "yes" or "no"}') from error
+        return reply
+
+
+def _named_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Refuse an object with two values of one name, such as two answers."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError("a name occurs twice")
+    return found
 
 
 def _tls(certificates: str) -> ssl.SSLContext:

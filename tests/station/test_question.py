@@ -139,12 +139,19 @@ NONSENSE = {
     "no JSON": (b"<html>yes</html>", "200 OK", "", "the reply is not"),
     "another word": (b'{"answer": "maybe"}', "200 OK", "", "the reply is not"),
     "a boolean": (b'{"answer": true}', "200 OK", "", "the reply is not"),
+    "two answers": (b'{"answer": "no", "answer": "yes"}', "200 OK", "", "the reply is not"),
     "a list": (b'["yes"]', "200 OK", "", "the reply is not"),
     "nothing": (b"", "200 OK", "", "the reply is not"),
     "too much": (b" " * (REPLY_MAX_SIZE + 1), "200 OK", "", "more than 65,536 bytes"),
     "a deep document": (b"[" * 50000, "200 OK", "", "the reply is not"),
     "no HTTP": (b"", "\x00", "", "no answer: "),
 }
+
+
+def test_a_reply_that_ends_too_early_is_no_answer(server: Server, tmp_path: Path) -> None:
+    head = b"HTTP/1.1 200 OK\r\nContent-Length: 100\r\n\r\n"
+    server.reply = lambda made: made.sendall(head + b'{"answer": "yes"}')
+    assert asked(server, tmp_path) == (False, "no answer: the reply is not complete")
 
 
 @pytest.mark.parametrize("name", NONSENSE)
