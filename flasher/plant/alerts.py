@@ -112,7 +112,7 @@ def overviews(
 def judge(status: StationStatus, activity: Activity, bounds: Bounds) -> StationOverview:
     """Check a station."""
     found = {
-        CheckKind.REFUSED: _refused(status),
+        CheckKind.REFUSED: _refused(status, bounds),
         CheckKind.SILENT: _silent(status, bounds),
         CheckKind.UNSENT: _unsent(status, bounds),
         CheckKind.YIELD: _yield(activity, bounds),
@@ -131,10 +131,15 @@ def _alert_if(is_alert: bool) -> CheckState:  # noqa: FBT001  it is the one argu
     return CheckState.ALERT if is_alert else CheckState.OK
 
 
-def _refused(status: StationStatus) -> _Judged:
+def _refused(status: StationStatus, bounds: Bounds) -> _Judged:
     if status.refusal:
         reason = printable(status.refusal)
         return CheckState.ALERT, text("its records are refused: {reason}", reason=reason)
+    if status.is_forked(bounds.silent_s):
+        reason = printable(status.other_refusal)
+        return CheckState.ALERT, text(
+            "the records of another PC are refused: {reason}", reason=reason
+        )
     if status.reported_at is None:
         return CheckState.UNKNOWN, text("has never connected")
     return CheckState.OK, text("its records are accepted")

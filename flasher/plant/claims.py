@@ -17,7 +17,7 @@ from sqlalchemy import Connection, select, text
 
 from flasher.log import log_event
 from flasher.plant.central import Central
-from flasher.plant.forwarder import ENTER
+from flasher.plant.forwarder import ENTER, Head, compare
 from flasher.station.records import chain, schema
 from flasher.station.records.branch import branches
 from flasher.station.records.database import Database, records_id_of
@@ -148,6 +148,7 @@ class PlantClaims:
                 own = self._enter(central)
                 values |= {"records": own.records, "takeover": own.takeover}
                 found = central.execute(_CLAIM, values).mappings().one()
+                self._compare(central, own)
             self._own = own
         except RecordError as error:
             with self._mutex:
@@ -206,6 +207,7 @@ class PlantClaims:
             with self._central.writing() as central:
                 own = self._enter(central)
                 if not self._is_swept:
+                    self._compare(central, own)
                     left += self._unknown(central, own)
                 if left:
                     central.execute(_RELEASE, {"tokens": left})
@@ -234,8 +236,21 @@ class PlantClaims:
         own = self._own
         if own is None:
             own = self._read()
-            central.execute(ENTER, {"records": own.records, "station": self._station})
+            self._head(central, own)
         return own
+
+    def _head(self, central: Connection, own: _Own) -> Head:
+        named = {"records": own.records, "station": self._station}
+        return Head(*central.execute(ENTER, named).one())
+
+    def _compare(self, central: Connection, own: _Own) -> None:
+        """Raise ChainRefusedError if the plant has other records of this station: another PC may
+        have passed the unit as this station.
+        """
+        head = self._head(central, own)
+        if head.number:
+            with self._records.reading() as local:
+                compare(head, self._station, local, central, where=self._central.shown)
 
     def _read(self) -> _Own:
         with self._records.reading() as local:

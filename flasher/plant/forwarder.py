@@ -55,6 +55,8 @@ _ADD_OPEN: Final = text(
     "INSERT INTO open_run (station, run_number, content) VALUES (:station, :run_number,"
     " CAST(:content AS json)) ON CONFLICT DO NOTHING"
 )
+_OF_TWO: Final = (Refusal.TAKEN_OVER, Refusal.FORKED, Refusal.REPLAYED)
+"""Refusals of one PC while another one, whose reports replace its own, may run as the station."""
 _TAKEN_OVER: Final = text("SELECT * FROM plant_taken_over()")
 _REPORT_OTHER: Final = text("SELECT plant_report_other(:refusal)")
 _ADD_TRACE: Final = text(
@@ -131,13 +133,34 @@ class _Batch:
 
 
 @dataclass(frozen=True)
-class _Head:
+class Head:
     """The last row that the database has of this station, and its clock."""
 
     station: UUID
     number: int
     hash: str
     now: datetime
+
+
+def compare(
+    head: Head, station: str, local: Connection, central: Connection, *, where: str
+) -> None:
+    """Compare the database's last row with the station's. Raises ChainRefusedError."""
+    found = chain.hash_at(local, station, head.number)
+    if found == head.hash:
+        return
+    taken: Any = central.execute(_TAKEN_OVER).one_or_none()
+    if taken and chain.last_takeover(local, station) != taken.hash:
+        what = "another PC runs the station"
+        if taken.data is not None:
+            computer = chain.data_of(taken.data).get("computer")
+            what = f"{computer} runs the station since {taken.at[:19]} UTC"
+        raise ChainRefusedError(Refusal.TAKEN_OVER, what, where=where)
+    if found is None:
+        what = f"the plant has row {head.number}, the station does not"
+        raise ChainRefusedError(Refusal.REPLAYED, what, where=where)
+    what = f"the plant has row {head.number} with another hash"
+    raise ChainRefusedError(Refusal.FORKED, what, where=where)
 
 
 class Forwarder:
@@ -172,7 +195,7 @@ class Forwarder:
         """Send a batch, and report the state; True if more rows wait."""
         self.error = None
         fault = refusal = ""
-        head: _Head | None = None
+        head: Head | None = None
         try:
             head = self._enter()
             batch = self._batch_after(head)
@@ -198,25 +221,26 @@ class Forwarder:
             query = chain.rows_after(self._station, self.state.sent).limit(1)
             return local.execute(query).first() is not None
 
-    def _enter(self) -> _Head:
+    def _enter(self) -> Head:
         """Ask the database for the last row that it has. Raises RecordError."""
         with self._central.writing() as central:
             named = {"records": self._records_id, "station": self._station}
-            return _Head(*central.execute(ENTER, named).one())
+            return Head(*central.execute(ENTER, named).one())
 
     @cached_property
     def _records_id(self) -> str:
         with self._records.reading() as local:
             return records_id_of(local)
 
-    def _batch_after(self, head: _Head) -> _Batch:
+    def _batch_after(self, head: Head) -> _Batch:
         """Read the rows after the database's last one. Raises ChainRefusedError for a last row that
         the station does not have.
         """
         batch = _Batch()
         with self._records.reading() as local:
             if head.number:
-                self._compare(local, head)
+                with self._central.writing() as central:
+                    compare(head, self._station, local, central, where=self._central.shown)
             following = chain.rows_after(self._station, head.number).limit(BATCH_ROWS)
             rows = local.execute(following).mappings().all()
             runs = {row["run_id"] for row in rows if row["event"] in _WITH_RUN}
@@ -247,26 +271,6 @@ class Forwarder:
                 )
         return batch
 
-    def _compare(self, local: Connection, head: _Head) -> None:
-        """Compare the database's last row with the station's. Raises ChainRefusedError."""
-        found = chain.hash_at(local, self._station, head.number)
-        if found == head.hash:
-            return
-        where = self._central.shown
-        with self._central.writing() as central:
-            taken: Any = central.execute(_TAKEN_OVER).one_or_none()
-        if taken and chain.last_takeover(local, self._station) != taken.hash:
-            what = "another PC runs the station"
-            if taken.data is not None:
-                computer = chain.data_of(taken.data).get("computer")
-                what = f"{computer} runs the station since {taken.at[:19]} UTC"
-            raise ChainRefusedError(Refusal.TAKEN_OVER, what, where=where)
-        if found is None:
-            what = f"the plant has row {head.number}, the station does not"
-            raise ChainRefusedError(Refusal.REPLAYED, what, where=where)
-        what = f"the plant has row {head.number} with another hash"
-        raise ChainRefusedError(Refusal.FORKED, what, where=where)
-
     def _traces_of(self, content: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
         """Attachments of a run. One that is missing or damaged is left out: `plant verify` reports
         it, and the runs after it are not held up.
@@ -296,7 +300,7 @@ class Forwarder:
 
     # -- state ------------------------------------------------------------------------------------
 
-    def _state_after(self, head: _Head | None, fault: str, refusal: str) -> ForwarderState:
+    def _state_after(self, head: Head | None, fault: str, refusal: str) -> ForwarderState:
         now, number, offset_s = self._clock.utc(), self.state.sent, self.state.clock_offset_s
         if head is not None:
             number, offset_s = head.number, (now - head.now).total_seconds()
@@ -336,9 +340,9 @@ class Forwarder:
             values["free"] = shutil.disk_usage(self._files.folder).free
         try:
             with self._central.writing() as central:
-                if state.refusal.startswith(Refusal.TAKEN_OVER):
+                if state.refusal.startswith(_OF_TWO):
                     central.execute(_REPORT_OTHER, {"refusal": state.refusal})
-                else:
+                if not state.refusal.startswith(Refusal.TAKEN_OVER):
                     central.execute(_REPORT, values)
         except RecordError as error:
             self.state = replace(state, fault=error.cause or error.what)

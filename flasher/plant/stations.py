@@ -9,6 +9,8 @@ from typing import Final
 
 from sqlalchemy import Connection, text
 
+from flasher.plant.central import Refusal
+
 _QUERY: Final = text("""
 SELECT p.name AS station, p.role, p.reported_at, p.version, p.unsent, p.oldest_unsent_at,
     p.clock_offset_s, p.disk_free_bytes, p.refusal, p.other_refusal, p.other_reported_at,
@@ -87,11 +89,19 @@ class StationStatus:
     refusal: str
     """Why the database refuses its chain; empty if it does not."""
     other_refusal: str
-    """Why it refuses a PC that ran as this station before another one took it over."""
+    """Why it refuses another PC that runs, or ran before a takeover, as this station."""
     other_reported_at: datetime | None
     """When that PC reported last."""
     recipes: tuple[SocketRecipe, ...] = ()
     """Recipes in use by socket, of a station that gets them from the plant."""
+
+    def is_forked(self, within_s: float) -> bool:
+        """True if another PC has reported as this station within this time, and was not taken
+        over.
+        """
+        if self.other_reported_at is None or self.other_refusal.startswith(Refusal.TAKEN_OVER):
+            return False
+        return (self.now - self.other_reported_at).total_seconds() <= within_s
 
 
 def statuses(connection: Connection) -> list[StationStatus]:

@@ -14,9 +14,11 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
 from typing import Any
+from uuid import UUID
 
 from flasher.plant import claims
 from flasher.plant.claims import LEASE_S, PlantClaims, _Own
+from flasher.plant.forwarder import ENTER
 from flasher.station.gate import Gate
 from flasher.station.records.errors import RecordError
 from flasher.station.records.model import Admission, ElsewhereState, Order, RunId
@@ -128,6 +130,9 @@ class _Link:
             state = centre.claim(station, *(values[name] for name in names))
             row = {"state": state, "station": "other", "socket": "A", "at": BEGIN, "run": 1}
             return SimpleNamespace(mappings=lambda: SimpleNamespace(one=lambda: row))
+        if statement is ENTER:
+            head = (UUID(int=0), 0, "", centre.clock.now)
+            return SimpleNamespace(one=lambda: head)
         if statement is claims._RENEW:
             centre.renew(station, values["tokens"], values["lease_s"])
         elif statement is claims._RELEASE:

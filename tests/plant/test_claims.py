@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import random
+import shutil
+import sqlite3
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -14,6 +16,7 @@ from typing import Any, NoReturn
 import pytest
 
 from flasher.errors import UsageError
+from flasher.plant.alerts import Bounds, CheckKind, CheckState, overviews
 from flasher.plant.central import Central
 from flasher.plant.claim_list import (
     ClaimFilter,
@@ -37,6 +40,7 @@ from flasher.station.records.model import (
     RunId,
     RunState,
 )
+from flasher.station.shift_counts import DEFAULT_SHIFTS
 from flasher.web.query_processes import Question
 from tests.loops import sample
 from tests.plant.claims_world import Centre, Claimed, Station, World, _Claims
@@ -339,6 +343,40 @@ def test_a_station_whose_records_were_replaced_claims_nothing(
     assert doubt in refused(there).what
     expire(plant)
     assert there.claim().unchecked.startswith(doubt)
+
+
+def test_a_copied_pc_passes_no_unit_of_the_other_one_without_a_mark(
+    plant: Plant, lines: tuple[Line, Line]
+) -> None:
+    """Two PCs with the name, the key and the records of one station."""
+    here, _ = lines
+    here.end(here.claim("W2605004"))
+    here.sender.send()
+    copied = Sender(plant, "line-2", plant.folder / "copied")
+    copied.end()
+    copied.bench.store.close()
+    with closing(sqlite3.connect(here.bench.path)) as source:
+        copied.bench.path.unlink()
+        with closing(sqlite3.connect(copied.bench.path)) as target:
+            source.backup(target)
+    shutil.copytree(here.bench.keys, copied.bench.keys, dirs_exist_ok=True)
+    copied.bench.store = copied.bench.opened()
+    copied.bench.store.recover()
+    copied.start()
+    other = Line(plant, "line-2", copied)
+    here.end(here.claim())
+    here.sender.send()
+    with closing(other):
+        assert other.asked().doubt.endswith("replayed: the plant has row 6, the station does not")
+        other.end(other.claim("W2605005"))
+        other.claims.tend()
+        assert "forked" in other.asked().doubt
+        other.sender.forwarder.forward()
+        here.sender.forwarder.forward()
+        with closing(Central(plant.url(READER))) as central, central.reading() as connection:
+            (found, _) = overviews(connection, Bounds(), DEFAULT_SHIFTS, datetime.now(UTC))
+        states = {each.kind: each.state for each in found.checks}
+        assert states[CheckKind.REFUSED] is CheckState.ALERT
 
 
 def test_a_server_that_is_away_is_asked_once(lines: tuple[Line, Line]) -> None:

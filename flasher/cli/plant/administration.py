@@ -132,7 +132,7 @@ def status(output: Output, url: str, bounds: BoundsOptions) -> int:
         output.result(printable(f"ALERT {station}: {check.text}"))
     output.results(passed_twice_lines(twice))
     code = ExitCode.PARTIAL if any(alerts(found)) else ExitCode.OK
-    if any(each.status.refusal for each in found):
+    if any(check.kind is CheckKind.REFUSED for _, check in alerts(found)):
         code = ExitCode.VERIFICATION
     return output.document(PlantStatusDocument(found, twice), exit_code=code)
 
