@@ -21,7 +21,6 @@ from flasher.host.options import (
     OTHER_TOOL_QUIET_S,
     UpgradeOptions,
     firmware_version,
-    overall_timeout_s,
 )
 from flasher.host.outcome import DeviceLeft, Outcome, Statistics, describe_progress
 from flasher.host.runner import Runner, Signal, Stage, StageInput
@@ -305,11 +304,9 @@ class UpgradeStage:
 
     # -- the stage -------------------------------------------------------------------------------
 
-    def stage(self, deadline_at: float | None = None) -> Stage[Outcome]:
-        """Run the upgrade; `deadline_at` is the overall deadline, computed if None."""
+    def stage(self, deadline_at: float) -> Stage[Outcome]:
+        """Run the upgrade; `deadline_at` is the overall deadline."""
         self._began_at = self._state_since = self._run.now
-        if deadline_at is None:
-            deadline_at = self._run.now + overall_timeout_s(self._plan, self._options)
         self._deadline_at = deadline_at
         self._run.listen_always(self._plan.target.answer_id)
         self._asks_for_power = self._options.at_power_up and not self.in_session

@@ -190,11 +190,9 @@ class MockDevice(Machine):
         """Number of erase and program operations completed since construction."""
         return self.erase_count + self.program_count
 
-    def readback(self, size_bytes: int | None = None) -> bytes:
-        """First `size_bytes` of the application area, complete or torn; None for the whole area."""
-        return self.store.read(
-            self.profile.application_area_bytes if size_bytes is None else size_bytes
-        )
+    def readback(self) -> bytes:
+        """Contents of the application area, complete or torn."""
+        return self.store.read(self.profile.application_area_bytes)
 
     def operation_reaches(self, share: float) -> float | None:
         """Time at which `share` (0 to 1) of the current flash operation is done, for a power cut

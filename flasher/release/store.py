@@ -80,10 +80,10 @@ def _seen_reader() -> Reader[Seen]:
 class TrustStore:
     """Trust files of this computer, in their folders."""
 
-    def __init__(self, folders: Sequence[Path] | None = None, seen: Path | None = None) -> None:
+    def __init__(self, folders: Sequence[Path] | None = None) -> None:
         """`folders` are the system's and the user's, in which new versions are stored."""
         self.folders = tuple(folders or trust_folders())
-        self._seen = seen or seen_folder()
+        self._seen = seen_folder()
 
     @property
     def path(self) -> Path:

@@ -135,11 +135,6 @@ TITLES: Final[dict[type[messages.UpgradeMessage], str]] = {
 """Titles of the upgrade messages."""
 
 
-def route(of_id: int) -> tuple[str, str] | None:
-    """Names of sender and receiver of an 11-bit CAN id; None for the id of no node."""
-    return ROUTES.get(of_id)
-
-
 def message_titles() -> tuple[str, ...]:
     """List the titles of all messages, each once."""
     titles = [item.title for item in catalogue.ITEMS] + list(TITLES.values())

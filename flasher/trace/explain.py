@@ -23,7 +23,7 @@ from flasher.protocol.spec import (
 )
 from flasher.protocol.text import printable
 from flasher.protocol.timing import DEFAULT_TIMINGS
-from flasher.trace.decoder import BusEvent, Kind, TimedDecoder, TimedEvent, bits_of, route
+from flasher.trace.decoder import ROUTES, BusEvent, Kind, TimedDecoder, TimedEvent, bits_of
 from flasher.trace.observed_upgrade import NEXT_UPGRADE_S, ObservedUpgrade, values_of
 from flasher.trace.steps import MAX_STEPS, StepList, mark_unanswered, step_of
 from flasher.trace.story import (
@@ -386,7 +386,7 @@ class BusCounter:
         if key in self._talkers or len(self._talkers) < _MAX_IDS:
             self._talkers[key] = self._talkers.get(key, 0) + 1
         if self.is_alone:
-            names = None if frame.is_extended else route(frame.can_id)
+            names = None if frame.is_extended else ROUTES.get(frame.can_id)
             self.is_alone = names is not None and names[0] == Node.CDL.name
 
     def note(self, event: BusEvent) -> None:
@@ -413,7 +413,7 @@ class BusCounter:
         """Return all senders except these 11-bit CAN ids, most frames first."""
         found = []
         for (of_id, is_extended), frames in self._talkers.items():
-            names = None if is_extended else route(of_id)
+            names = None if is_extended else ROUTES.get(of_id)
             if of_id in but and not is_extended:
                 continue
             kind = TalkerKind.FOREIGN if names is None else TalkerKind.NODE

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from flasher.host.options import UpgradeOptions
+from flasher.host.options import UpgradeOptions, overall_timeout_s
 from flasher.host.outcome import Outcome
 from flasher.host.runner import Runner
 from flasher.host.table import UpgradeState
@@ -16,7 +16,7 @@ class Upgrade(Runner[Outcome]):
     def __init__(self, plan: Plan, options: UpgradeOptions | None = None) -> None:
         chosen = options or UpgradeOptions()
         super().__init__(
-            lambda _run: self._upgrade.stage(),
+            lambda run: self._upgrade.stage(run.now + overall_timeout_s(plan, chosen)),
             bitrate_bps=plan.bitrate_bps,
             timings=chosen.timings,
             frame_gap_s=chosen.frame_gap_s,
