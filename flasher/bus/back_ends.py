@@ -90,6 +90,8 @@ _REPORT_TEXTS: Final = (
 """Error messages of PCAN and IXXAT, whose exceptions have no code."""
 _UNREADABLE_TEXT: Final = re.compile(r"invalid delimiter|could not unpack|out of range")
 """Error messages of back ends that raise CanError for a damaged frame (serial, udp_multicast)."""
+_TRACEBACK: Final = "Traceback (most recent call last)"
+"""The socketcand back end adds one to its messages."""
 _FOREIGN_DATAGRAM: Final = "could not unpack"
 
 
@@ -140,7 +142,7 @@ def error_text(error: BaseException) -> str:
     """Messages of an exception and its causes without full stop, or its type if there are none."""
     texts: list[str] = []
     for each in causes(error):
-        words = str(each).strip().rstrip(".!")
+        words = str(each).partition(_TRACEBACK)[0].strip().rstrip(".!")
         if words and not any(words in earlier for earlier in texts):
             texts.append(words)
     return ": ".join(texts) or type(error).__name__

@@ -7,7 +7,8 @@ import contextlib
 import errno
 import importlib.util
 import re
-from collections.abc import Mapping
+import socket
+from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 from flasher.bus.back_ends import SERIAL_PORTS, causes, error_text
@@ -27,6 +28,8 @@ from flasher.errors import BusError, ErrorCode, UsageError, install_command
 from flasher.protocol.text import printable
 from flasher.python_can import can
 
+_ANSWER_LIMIT_S: Final = 5.0
+"""Maximum time for each answer of a socketcand server while it is opened."""
 _CHANNELS: Final = {
     "pcan": "PCAN_USBBUS1",
     "slcan": "COM3",
@@ -150,7 +153,8 @@ def open_bus(config: Mapping[str, Any], *, sends: bool = True) -> can.BusABC:
     """
     interface, channel = str(config["interface"]), config.get("channel")
     try:
-        bus = can.Bus(**config, ignore_config=True)
+        with _answers_limited() if interface == "socketcand" else contextlib.nullcontext():
+            bus = can.Bus(**config, ignore_config=True)
     except Exception as error:
         where = f"interface {interface}, channel {channel}"
         raise _software_missing(interface, where, error) or BusError(
@@ -167,6 +171,19 @@ def open_bus(config: Mapping[str, Any], *, sends: bool = True) -> can.BusABC:
                 bus.shutdown()
             raise failure
     return bus
+
+
+@contextlib.contextmanager
+def _answers_limited() -> Iterator[None]:
+    """Give the sockets that are made here a time limit: python-can awaits the greeting of a
+    socketcand server without one.
+    """
+    before = socket.getdefaulttimeout()
+    socket.setdefaulttimeout(_ANSWER_LIMIT_S)
+    try:
+        yield
+    finally:
+        socket.setdefaulttimeout(before)
 
 
 def _unusable(channel: str, bitrate_bps: object, *, sends: bool) -> BusError | None:
@@ -275,6 +292,8 @@ def _opening_cause(interface: str, error: Exception) -> str:
         return "the interface does not exist or is down"
     if interface in SERIAL_PORTS:
         return "it is not plugged in, its port has another name, or another program uses it"
+    if interface == "socketcand":
+        return "no socketcand server answers at this host and port, or it has no such channel"
     if interface == "udp_multicast":
         return "the channel is not a multicast address"
     if isinstance(error, NameError | ImportError | AttributeError):

@@ -8,11 +8,13 @@ it means. Back ends that run without hardware are run themselves further down.
 from __future__ import annotations
 
 import errno
+import gc
 import itertools
 import socket
 import struct
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -28,6 +30,7 @@ from flasher.bus import adapter
 from flasher.bus.adapter import CanLink, open_adapter
 from flasher.bus.health import ControllerState, TroubleKind
 from flasher.bus.link import AT_ONCE, SEND_LIMIT_S
+from flasher.bus.opening import open_bus
 from flasher.errors import BusError, ErrorCode, TransmitBlockedError
 from flasher.protocol.frame import Frame
 from tests.bus.test_adapter import FRAME, FakeBus, message
@@ -718,11 +721,29 @@ def test_a_socketcand_that_sends_nonsense_or_is_gone_is_lost() -> None:
         with pytest.raises(BusError, match="7zz") as caught:
             link.receive(time.perf_counter() + 10.0)
         assert caught.value.code is LOST
+        assert "Traceback" not in caught.value.what
     with socketcand() as (link, server):
         server.close()
         with pytest.raises(BusError, match="returns at once") as caught:
             link.receive(time.perf_counter() + 10.0)
         assert caught.value.code is LOST
+
+
+def test_a_socketcand_that_greets_nobody_ends_in_bounded_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("flasher.bus.opening._ANSWER_LIMIT_S", 0.05)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        config = {"interface": "socketcand", "channel": "can0", "host": "127.0.0.1"}
+        with pytest.raises(BusError, match="cannot be opened: timed out") as caught:
+            open_bus({**config, "port": server.getsockname()[1]})
+    assert "no socketcand server answers" in caught.value.cause
+    assert socket.getdefaulttimeout() is None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)  # python-can leaves its socket open
+        caught.value.__cause__ = None
+        del caught
+        gc.collect()
 
 
 def test_a_controller_that_is_off_by_exception_is_told_as_by_an_error_frame(bus: FakeBus) -> None:
