@@ -45,6 +45,7 @@ from flasher.bus.lock import acquire, lock_name
 from flasher.bus.opening import bus_config, open_bus
 from flasher.bus.physical import is_physical
 from flasher.errors import BusError, ErrorCode, TransmitBlockedError
+from flasher.i18n import text
 from flasher.protocol.frame import EXTENDED_ID_MAX, STANDARD_ID_MAX, Frame
 from flasher.protocol.spec import FRAME_DATA_SIZE
 from flasher.python_can import can
@@ -438,12 +439,19 @@ class CanLink:
         )
 
     def _blocked(self, error: Exception) -> TransmitBlockedError:
+        cause = (
+            "no node on the bus acknowledges (device off, wrong bit rate, wiring, termination), or "
+            "other traffic takes the whole bus"
+        )
+        remedy = "Check that the device has power and that the bit rate is right."
+        if self._port is not None:
+            cause = text("the adapter hangs; or {cause}", cause=cause)
+            remedy = text("{remedy} Unplug the adapter and plug it in again.", remedy=remedy)
         return TransmitBlockedError(
             f"The adapter took no frame for {SEND_LIMIT_S:g} s: {error_text(error)}.",
             where=str(self),
-            cause="no node on the bus acknowledges (device off, wrong bit rate, wiring, "
-            "termination), or other traffic takes the whole bus",
-            remedy="Check that the device has power and that the bit rate is right.",
+            cause=cause,
+            remedy=remedy,
         )
 
 

@@ -336,4 +336,6 @@ def _opening_remedy(interface: str, channel: object, bitrate_bps: object, error:
         return f"Name one, as in `-i udp_multicast -c {_CHANNELS[interface]}`."
     if interface == "socketcand" and isinstance(error, TypeError):
         return "Name its server with `--bus-kwargs host=HOST --bus-kwargs port=29536`."
+    if interface == "socketcand":
+        return "Start socketcand there with this channel, and compare host and port."
     return "Plug it in, close other programs that use it, install its driver."

@@ -738,6 +738,7 @@ def test_a_socketcand_that_greets_nobody_ends_in_bounded_time(
         with pytest.raises(BusError, match="cannot be opened: timed out") as caught:
             open_bus({**config, "port": server.getsockname()[1]})
     assert "no socketcand server answers" in caught.value.cause
+    assert "Start socketcand there" in caught.value.remedy
     assert socket.getdefaulttimeout() is None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ResourceWarning)  # python-can leaves its socket open
