@@ -21,9 +21,14 @@ from flasher.protocol.text import printable
 
 LOG_FILE: Final = "--log-file"
 _PYTHON_CAN: Final = "can"
-_ALSO_RAISED: Final = ("was not properly shut down", "Could not access SocketCAN device")
-"""Texts that python-can logs about a bus that it cannot open, besides raising an error: a command
-that waits for an adapter tries again."""
+_ALSO_RAISED: Final = (
+    "was not properly shut down",
+    "Could not access SocketCAN device",
+    "Failed to receive: ",
+    "Failed to connect to server: ",
+)
+"""Texts that python-can logs about a bus that it cannot open or read, besides raising an error: a
+command that waits for an adapter tries again."""
 _NOWHERE: Final = logging.NullHandler()
 _NOTHING: Final = logging.CRITICAL + 1
 _ON_STDERR: Final = {

@@ -306,6 +306,9 @@ def test_a_bus_that_could_not_be_opened_is_no_warning_beside_its_failure(
         logging.getLogger("can.interfaces.socketcan.socketcan").error(
             "Could not access SocketCAN device %s (%s)", "can0", "No such device"
         )
+        logging.getLogger("can.interfaces.socketcand.socketcand").error(
+            "Failed to receive: invalid literal  Traceback (most recent call last):\n  File x"
+        )
         logging.getLogger("can.bus").warning("something else")
         raise OSError("no socket")
 
@@ -315,3 +318,4 @@ def test_a_bus_that_could_not_be_opened_is_no_warning_beside_its_failure(
     assert "something else" in said
     assert "properly" not in said
     assert "Could not access" not in said
+    assert "Traceback" not in said

@@ -183,9 +183,11 @@ def test_an_adapter_that_takes_nothing_ends_a_send_in_bounded_time(
 
     with (
         api.connect(interface="slcan", channel=str(adapter.port), sleep_after_open=0.0) as bus,
-        pytest.raises(TransmitBlockedError),
+        pytest.raises(TransmitBlockedError) as caught,
     ):
         fill(bus.link)
+    assert "the adapter hangs" in caught.value.cause
+    assert "plug it in again" in caught.value.remedy
     assert time.perf_counter() - began < 5.0
 
 
