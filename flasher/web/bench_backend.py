@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, Unpack
 
-from flasher.api import Connection, Job, Result
+from flasher.api import CallOptions, Connection, Job, Result
 from flasher.errors import FlasherError
 from flasher.history import Flash
 from flasher.protocol.spec import Dialect, Target
@@ -49,14 +49,7 @@ class BenchBackend(Protocol):
     def model_area(self) -> Area | None:
         """Memory area of a device model; None for real devices."""
 
-    def back_up(
-        self,
-        adapter: Adapter,
-        area: Area | None,
-        *,
-        on_event: Callable[[object], None],
-        cancelled: Callable[[], bool],
-    ) -> Saved:
+    def back_up(self, adapter: Adapter, area: Area | None, **watch: Unpack[CallOptions]) -> Saved:
         """Save the battery's answers and the memory of an area to a new file."""
 
     def upgrade(
@@ -66,7 +59,6 @@ class BenchBackend(Protocol):
         connect: Callable[[], AbstractContextManager[Connection]],
         *,
         keeps_settings: bool,
-        on_event: Callable[[object], None],
-        cancelled: Callable[[], bool],
+        **watch: Unpack[CallOptions],
     ) -> UpgradeEnding:
         """Run an upgrade to its end and store its records; `connect` opens the adapter."""

@@ -67,9 +67,10 @@ class HeldBikes(VirtualBikes):
         adapter: Adapter,
         job: Job,
         *args: Any,
-        on_event: Callable[[object], None],
         **more: Any,
     ) -> UpgradeEnding:
+        on_event = more.pop("on_event")
+
         def held(event: object) -> None:
             on_event(event)
             self.hold(event)

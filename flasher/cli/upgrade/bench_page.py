@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Final, Unpack
 
 import click
 from platformdirs import user_state_path
@@ -120,20 +120,13 @@ class _Place:
     def model_area(self) -> Area | None:
         return DEVICE_MODEL if self._bus.mock else None
 
-    def back_up(
-        self,
-        adapter: Adapter,
-        area: Area | None,
-        *,
-        on_event: Callable[[object], None],
-        cancelled: Callable[[], bool],
-    ) -> Saved:
+    def back_up(self, adapter: Adapter, area: Area | None, **watch: Unpack[CallOptions]) -> Saved:
         with (
             recording(RecordingOptions(), self.bus(adapter), self._output, target=BMS) as record,
             self.connect(adapter) as connection,
         ):
             record.opened(connection)
-            watch: CallOptions = {"taps": record.taps, "on_event": on_event, "cancelled": cancelled}
+            watch["taps"] = record.taps
             device = connection.device(BMS, dialect=self.dialect, **watch)
             found = device.identify()
             data = b""
@@ -160,16 +153,14 @@ class _Place:
         connect: Callable[[], AbstractContextManager[Connection]],
         *,
         keeps_settings: bool,
-        on_event: Callable[[object], None],
-        cancelled: Callable[[], bool],
+        **watch: Unpack[CallOptions],
     ) -> UpgradeEnding:
         output = self._output
 
         @contextmanager
         def watching(connection: Connection, record: Recording) -> Iterator[CallOptions]:
             output.progress(f"{job.plan.target.node.name} on {connection.name} ...")
-            hung_up = partial(record.hung_up, self._stop, output)
-            yield {"on_event": on_event, "cancelled": cancelled, "hung_up": hung_up}
+            yield {**watch, "hung_up": partial(record.hung_up, self._stop, output)}
 
         upgrade_run = UpgradeRun(job, self.bus(adapter), RecordingOptions(), output)
         upgrade_run.keeps_settings = keeps_settings
@@ -263,19 +254,22 @@ class VirtualBikes(_Place):
         job: Job,
         connect: Callable[[], AbstractContextManager[Connection]],
         *,
-        on_event: Callable[[object], None],
-        **more: Any,
+        keeps_settings: bool,
+        **watch: Unpack[CallOptions],
     ) -> UpgradeEnding:
         """Upgrade with few attempts, to show a bike's fault before the overall deadline."""
         bike = self._bikes[adapter.name]
         job = replace(job, options=replace(job.options, attempts=DEFAULT_ATTEMPTS))
         bike.begin(job)
+        handle = watch.get("on_event")
 
         def listener(event: object) -> None:
-            on_event(event)
+            if handle is not None:
+                handle(event)
             bike.happened(event)
 
-        ending = super().upgrade(adapter, job, connect, on_event=listener, **more)
+        watch["on_event"] = listener
+        ending = super().upgrade(adapter, job, connect, keeps_settings=keeps_settings, **watch)
         bike.ended()
         return ending
 
