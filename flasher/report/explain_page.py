@@ -248,7 +248,6 @@ def _item(
     if isinstance(line, PacketRun):
         some = f"packet {line.first}" if line.count == 1 else f"packets {line.first} to {line.last}"
         return sequence.DiagramItem(
-            sequence.ItemKind.BLOCK,
             line.begin_s,
             f"{some} acknowledged",
             translate(text("in {time}", time=duration_text(line.end_s - line.begin_s))),
@@ -256,7 +255,6 @@ def _item(
         )
     if not line.sender or line.kind not in (StepKind.MESSAGE, StepKind.DAMAGED):
         return sequence.DiagramItem(
-            sequence.ItemKind.BLOCK,
             line.at_s,
             line.title,
             line.text,
@@ -264,7 +262,6 @@ def _item(
             end_s=None if line.kind is StepKind.GAP else line.at_s,
         )
     return sequence.DiagramItem(
-        sequence.ItemKind.ARROW,
         line.at_s,
         line.title,
         ", ".join(_field(part, translate) for part in line.text.split(", ")),

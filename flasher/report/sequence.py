@@ -11,7 +11,6 @@ import textwrap
 import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from enum import Enum
 from typing import Final, NamedTuple
 
 from flasher.report.base import shortened, visible
@@ -38,21 +37,13 @@ _MARK: Final = "! "
 """Prefix of trouble, which colour alone must not mark."""
 
 
-class ItemKind(Enum):
-    """Shape of an item."""
-
-    ARROW = "arrow"
-    BLOCK = "block"
-    """Box across all lifelines: a summary of messages, or a remark."""
-
-
 @dataclass(frozen=True)
 class DiagramItem:
     """Item of a diagram. An arrow goes from `sender` to `receiver`; a receiver that is not a
-    participant means all of them.
+    participant means all of them. An item without sender is a block, a box across all lifelines: a
+    summary of messages, or a remark.
     """
 
-    kind: ItemKind
     at_s: float
     title: str
     text: str = ""
@@ -76,7 +67,7 @@ class DiagramRow:
     label, at the beginning of its first line.
     """
 
-    kind: ItemKind
+    is_arrow: bool
     time: str
     top: float
     y: float
@@ -126,7 +117,7 @@ def _omitted_block(items: Sequence[DiagramItem]) -> DiagramItem:
     troubles = sum(item.is_trouble for item in items)
     text = f"{troubles:,} of them with trouble" if troubles else ""
     title = f"{len(items):,} {'step' if len(items) == 1 else 'steps'} not drawn"
-    return DiagramItem(ItemKind.BLOCK, items[0].at_s, title, text, is_trouble=bool(troubles))
+    return DiagramItem(items[0].at_s, title, text, is_trouble=bool(troubles))
 
 
 def diagram(
@@ -180,10 +171,10 @@ def _with_pauses(items: Iterable[DiagramItem], translate: Translator) -> Iterabl
     previous_s: float | None = None
     for item in items:
         # A block without an end is a pause itself, or replaces steps that are not drawn.
-        is_open = item.kind is ItemKind.BLOCK and item.end_s is None
+        is_open = not item.sender and item.end_s is None
         if previous_s is not None and not is_open and item.at_s - previous_s >= _QUIET_S:
             quiet = translate.numbers(duration_text(item.at_s - previous_s))
-            yield DiagramItem(ItemKind.BLOCK, previous_s, translate(f"{quiet} later"))
+            yield DiagramItem(previous_s, translate(f"{quiet} later"))
         yield replace(item, title=translate(item.title), text=translate(item.text))
         previous_s = None if is_open else item.end_s or item.at_s
 
@@ -194,7 +185,7 @@ def time_text(seconds: float) -> str:
 
 
 def _row(item: DiagramItem, lifelines: Sequence[Lifeline], top: float, width: float) -> DiagramRow:
-    if item.kind is ItemKind.BLOCK:
+    if not item.sender:
         return _block(item, top, width)
     at = {line.name: line.x for line in lifelines}
     begin_x = at.get(item.sender, lifelines[0].x)
@@ -210,7 +201,7 @@ def _row(item: DiagramItem, lifelines: Sequence[Lifeline], top: float, width: fl
     y = top + _LINE_HEIGHT * len(lines) + _EDGE
     time = time_text(item.at_s)
     return DiagramRow(
-        item.kind, time, top, y, begin_x, tips, label_x, title, lines, item.is_trouble
+        bool(item.sender), time, top, y, begin_x, tips, label_x, title, lines, item.is_trouble
     )
 
 
@@ -220,7 +211,7 @@ def _block(item: DiagramItem, top: float, width: float) -> DiagramRow:
     y = top + _LINE_HEIGHT * len(lines) + _EDGE * 1.5
     time, label_x = time_text(item.at_s), (left + right) / 2
     return DiagramRow(
-        item.kind, time, top, y, left, (right,), label_x, title, lines, item.is_trouble
+        bool(item.sender), time, top, y, left, (right,), label_x, title, lines, item.is_trouble
     )
 
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flasher.report.chart import WIDTHS
-from flasher.report.sequence import DiagramItem, ItemKind, Part, diagram, thinned
+from flasher.report.sequence import DiagramItem, Part, diagram, thinned
 
 WIDE = WIDTHS["wide"]
 
@@ -15,7 +15,7 @@ WIDE = WIDTHS["wide"]
 def arrow(
     at_s: float, sender: str = "CDL", receiver: str = "BMS", title: str = "reset"
 ) -> DiagramItem:
-    return DiagramItem(ItemKind.ARROW, at_s, title, "", sender, receiver)
+    return DiagramItem(at_s, title, "", sender, receiver)
 
 
 def only(parts: list[Part]) -> Part:
@@ -55,21 +55,21 @@ def test_one_participant_alone_can_be_drawn() -> None:
 
 
 def test_the_title_is_the_beginning_of_the_first_line() -> None:
-    item = DiagramItem(ItemKind.ARROW, 0, "boot version", "name BMS, version V1.0.0", "BMS", "CDL")
+    item = DiagramItem(0, "boot version", "name BMS, version V1.0.0", "BMS", "CDL")
     row = only(diagram([item], ["CDL", "BMS"], WIDE)).rows[0]
     assert row.title == "boot version"
     assert row.lines == ("boot version: name BMS, version V1.0.0",)
 
 
 def test_trouble_is_marked_by_a_sign_too() -> None:
-    item = DiagramItem(ItemKind.ARROW, 0, "NAK", "number 3", "BMS", "CDL", is_trouble=True)
+    item = DiagramItem(0, "NAK", "number 3", "BMS", "CDL", is_trouble=True)
     row = only(diagram([item], ["CDL", "BMS"], WIDE)).rows[0]
     assert row.is_trouble
     assert row.lines == ("! NAK: number 3",)
 
 
 def test_a_long_text_is_broken_into_lines_that_end_in_an_ellipsis() -> None:
-    item = DiagramItem(ItemKind.ARROW, 0, "x" * 3000, "word " * 500, "CDL", "BMS")
+    item = DiagramItem(0, "x" * 3000, "word " * 500, "CDL", "BMS")
     row = only(diagram([item], ["CDL", "BMS"], WIDTHS["narrow"])).rows[0]
     assert len(row.lines) <= 4
     assert row.lines[-1].endswith("\u2026")
@@ -77,7 +77,7 @@ def test_a_long_text_is_broken_into_lines_that_end_in_an_ellipsis() -> None:
 
 
 def test_escaped_characters_count_with_the_length_that_they_are_shown_with() -> None:
-    item = DiagramItem(ItemKind.ARROW, 0, "boot version", "\u202e" * 60, "BMS", "CDL")
+    item = DiagramItem(0, "boot version", "\u202e" * 60, "BMS", "CDL")
     row = only(diagram([item], ["CDL", "BMS"], WIDE)).rows[0]
     assert "\\u202e" in "".join(row.lines)
     assert max(map(len, row.lines)) < 130
@@ -89,13 +89,13 @@ def test_a_long_pause_is_said_and_a_short_one_is_not() -> None:
 
 
 def test_a_pause_that_the_dialogue_names_itself_is_not_said_twice() -> None:
-    gap = DiagramItem(ItemKind.BLOCK, 4.0, "4 s of silence")
+    gap = DiagramItem(4.0, "4 s of silence")
     drawn = only(diagram([arrow(0), gap, arrow(4)], ["CDL", "BMS"], WIDE))
     assert [row.lines[0] for row in drawn.rows] == ["reset", "4 s of silence", "reset"]
 
 
 def test_a_folded_run_counts_as_talk_until_its_end() -> None:
-    run = DiagramItem(ItemKind.BLOCK, 0.1, "packets 1 to 300", end_s=3.5)
+    run = DiagramItem(0.1, "packets 1 to 300", end_s=3.5)
     drawn = only(diagram([arrow(0), run, arrow(3.6), arrow(5.6)], ["CDL", "BMS"], WIDE))
     assert [row.lines[0] for row in drawn.rows] == [
         "reset",
@@ -122,7 +122,7 @@ def test_a_short_dialogue_is_left_as_it_is() -> None:
 
 def test_a_long_dialogue_keeps_its_ends_and_what_is_around_troubles() -> None:
     items = [arrow(number / 10, title=f"{number}") for number in range(1000)]
-    items[500] = DiagramItem(ItemKind.ARROW, 50.0, "NAK", "", "BMS", "CDL", is_trouble=True)
+    items[500] = DiagramItem(50.0, "NAK", "", "BMS", "CDL", is_trouble=True)
     titles = [item.title for item in thinned(items, 60)]
     assert titles[:2] == ["0", "1"]
     assert titles[-1] == "999"
@@ -133,12 +133,11 @@ def test_a_long_dialogue_keeps_its_ends_and_what_is_around_troubles() -> None:
 
 def test_what_is_left_out_of_a_dialogue_full_of_trouble_says_so() -> None:
     items = [
-        DiagramItem(ItemKind.ARROW, number / 10, "NAK", "", "BMS", "CDL", is_trouble=True)
-        for number in range(1000)
+        DiagramItem(number / 10, "NAK", "", "BMS", "CDL", is_trouble=True) for number in range(1000)
     ]
     shown = thinned(items, 60)
     assert len(shown) < 80
-    blocks = [item for item in shown if item.kind is ItemKind.BLOCK]
+    blocks = [item for item in shown if not item.sender]
     assert blocks
     assert all("with trouble" in block.text and block.is_trouble for block in blocks)
 
@@ -147,11 +146,10 @@ def test_what_is_left_out_of_a_dialogue_full_of_trouble_says_so() -> None:
 @given(st.lists(st.booleans(), max_size=400), st.integers(9, 60))
 def test_thinning_accounts_for_every_step(troubles: list[bool], most: int) -> None:
     items = [
-        DiagramItem(ItemKind.ARROW, number / 10, "x", "", "A", "B", is_trouble=trouble)
+        DiagramItem(number / 10, "x", "", "A", "B", is_trouble=trouble)
         for number, trouble in enumerate(troubles)
     ]
     total = sum(
-        int(item.title.split()[0]) if item.kind is ItemKind.BLOCK else 1
-        for item in thinned(items, most)
+        int(item.title.split()[0]) if not item.sender else 1 for item in thinned(items, most)
     )
     assert total == len(items)
