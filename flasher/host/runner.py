@@ -55,6 +55,8 @@ class Runner(Generic[T]):
         self.timings = timings
         self.bitrate_bps = bitrate_bps
         self.tx = Transmitter(bitrate_bps, frame_gap_s, timings.inter_frame_timeout_s)
+        self.send = self.tx.queue
+        """Send a message; `Signal.LEFT` follows when it was sent (`tx.left_at`, `tx.left_tag`)."""
         self.next_frame: Callable[[float], Frame | None] = self.tx.next_frame
         self.frame_sent: Callable[[float], Any] = self.tx.frame_sent
         self.tx.on_message_sent = self._message_left
@@ -107,17 +109,6 @@ class Runner(Generic[T]):
         """Return that of this CAN id, which may hold the first part of a message, or a new one."""
         known = self._listening.get(can_id)
         return known or Reassembler(can_id, self.timings.inter_frame_timeout_s)
-
-    def send(
-        self,
-        frames: Sequence[Frame],
-        *,
-        wire_s: float | None = None,
-        not_before: float = 0.0,
-        tag: object = None,
-    ) -> None:
-        """Send a message; `Signal.LEFT` follows when it was sent (`tx.left_at`, `tx.left_tag`)."""
-        self.tx.queue(frames, wire_s=wire_s, not_before=not_before, tag=tag)
 
     def emit(self, event: object) -> None:
         """Report an event."""
