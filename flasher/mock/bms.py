@@ -100,7 +100,7 @@ class ShutdownSequence:
         """Repeat SHUTDOWN, or switch off."""
         if now >= self._off_at:
             self._port.emit(ShutdownEnded(_names(self._answered), _names(self._missing)))
-            self._port.switch_off(now)
+            self._port.power_cut(now)
         elif self._missing and now >= self.due_at:
             if self._port.is_idle:
                 self._port.send(encode(self._announcement, contents.Shutdown()))

@@ -137,9 +137,6 @@ class Machine(ABC):
     def emit(self, event: object) -> None:
         self._events.append(event)
 
-    def switch_off(self, now: float) -> None:
-        self.power_cut(now)
-
     def hold_key(self, now: float) -> None:
         """Tell the application that the key was held long enough to switch off."""
         if self._runs_application:

@@ -73,12 +73,12 @@ class _UpgradeMessage:
             assert cls._STRUCT.size == data_size(cls.COMMAND)
 
     def data(self) -> bytes:
-        raise NotImplementedError
+        return self._STRUCT.pack(*vars(self).values())
 
     @classmethod
     def from_data(cls, data: bytes) -> Self:
         """Decode message data. Raises ValueError for data that differ from the document."""
-        raise NotImplementedError
+        return cls(*cls._STRUCT.unpack(data))
 
     def to_message(self, can_id: int) -> Message:
         return Message(can_id, self.MODE, self.COMMAND, self.data())
@@ -117,13 +117,6 @@ class _Numbered(_UpgradeMessage):
     LAYOUT = (("number", NumberField(2)),)
 
     number: int
-
-    def data(self) -> bytes:
-        return self._STRUCT.pack(self.number)
-
-    @classmethod
-    def from_data(cls, data: bytes) -> Self:
-        return cls(*cls._STRUCT.unpack(data))
 
 
 @dataclass(frozen=True)
