@@ -162,10 +162,6 @@ class Transmitter:
         self._quiet_until = quiet_until
         self.due_at = inf
 
-    def deadline(self) -> float | None:
-        """Time of the next frame to send; None while the queue is empty."""
-        return None if self.due_at == inf else self.due_at
-
     def drop_stalled(self, now: float) -> bool:
         """Send a partly sent message again if this computer paused in it; return True if so. The
         receiver has dropped its first part, or refuses it (R12).

@@ -99,7 +99,7 @@ _NOTHING: Final[tuple[Message | Damage, ...]] = ()
 class Reassembler:
     """Reassembles the messages of one CAN id from the data of its frames.
 
-    Call `tick` at `deadline` or later. An unfinished message is dropped `inter_frame_timeout_s`
+    Call `tick` at `due_at` or later. An unfinished message is dropped `inter_frame_timeout_s`
     after its last frame (R12), but only by `tick`: frames that were queued while the computer was
     busy are not late.
     """
@@ -130,10 +130,6 @@ class Reassembler:
         if not self._buffer and not self._junk:
             self.due_at = inf
         return found
-
-    def deadline(self) -> float | None:
-        """Time of the next `tick`; None while the buffer is empty."""
-        return None if self.due_at == inf else self.due_at
 
     def tick(self, now: float) -> Sequence[Message | Damage]:
         """Drop bytes that waited too long; return the damage and messages among them."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
+from math import inf
 from typing import Final
 
 from flasher.protocol import catalogue, messages
@@ -43,7 +44,7 @@ def take_frames(data: bytes) -> None:
             stream += payload
             found += reassembler.feed(payload, now)
             assert reassembler.buffered_bytes <= HELD_MAX
-        assert (reassembler.deadline() is None) == (reassembler.buffered_bytes == 0)
+        assert (reassembler.due_at == inf) == (reassembler.buffered_bytes == 0)
     found += reassembler.tick(now + 1.0)
     assert reassembler.buffered_bytes == 0
     assert bool(found) == bool(stream)

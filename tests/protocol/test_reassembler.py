@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import inf
 from typing import Final
 
 import pytest
@@ -59,7 +60,7 @@ def test_a_frame_without_bytes_changes_nothing() -> None:
     reassembler = make_reassembler(_ID)
     interleaved = [part for payload in _RESET.payloads for part in (b"", payload, b"")]
     assert feed_all(reassembler, interleaved) == [_RESET.message]
-    assert reassembler.deadline() is None
+    assert reassembler.due_at == inf
 
 
 # -- header and tail inside data (FR-03) ------------------------------------------------------
@@ -221,7 +222,7 @@ def test_a_packet_with_two_swapped_frames_is_not_accepted(swapped: int) -> None:
 def test_a_partial_message_waits_until_just_before_the_timeout() -> None:
     reassembler = make_reassembler(_ID)
     reassembler.feed(_RESET.payloads[0], 5.0)
-    assert reassembler.deadline() == pytest.approx(5.1)
+    assert reassembler.due_at == pytest.approx(5.1)
     assert list(reassembler.tick(5.0999)) == []
     assert list(reassembler.feed(_RESET.payloads[1], 5.0999)) == [_RESET.message]
 
@@ -230,12 +231,12 @@ def test_a_partial_message_waits_until_just_before_the_timeout() -> None:
 def test_a_partial_message_is_dropped_at_the_timeout_and_after(late_s: float) -> None:
     reassembler = make_reassembler(_ID)
     reassembler.feed(_RESET.payloads[0], 5.0)
-    deadline = reassembler.deadline()
-    assert deadline is not None
+    deadline = reassembler.due_at
+    assert deadline < inf
     found = list(reassembler.tick(deadline + late_s))
     assert found == [Damage(_ID, DamageReason.INCOMPLETE, _RESET.payloads[0])]
     assert reassembler.buffered_bytes == 0
-    assert reassembler.deadline() is None
+    assert reassembler.due_at == inf
     assert feed_all(reassembler, _RESET.payloads, now=6.0) == [_RESET.message]
 
 
@@ -268,12 +269,12 @@ def test_junk_is_reported_after_silence_at_the_latest(junk: bytes) -> None:
     assert feed_all(reassembler, [junk]) == []
     found = list(reassembler.tick(INTER_FRAME_TIMEOUT_S))
     assert found == [Damage(_ID, DamageReason.JUNK, junk)]
-    assert reassembler.deadline() is None
+    assert reassembler.due_at == inf
 
 
 def test_without_anything_held_there_is_nothing_to_wait_for() -> None:
     reassembler = make_reassembler(_ID)
-    assert reassembler.deadline() is None
+    assert reassembler.due_at == inf
     assert list(reassembler.tick(1e9)) == []
 
 
@@ -294,7 +295,7 @@ def test_reset_forgets_what_was_held() -> None:
     feed_all(reassembler, [b"\x01\x02", *_PACKET.payloads[:5]])
     reassembler.reset()
     assert reassembler.buffered_bytes == 0
-    assert reassembler.deadline() is None
+    assert reassembler.due_at == inf
 
 
 def test_the_first_message_after_a_reset_in_the_midst_of_a_packet_is_found() -> None:

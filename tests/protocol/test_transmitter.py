@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import inf
 from typing import Final
 
 import pytest
@@ -42,7 +43,7 @@ def _send_at_bus_pace(transmitter: Transmitter, now: float) -> tuple[list[Frame]
 def test_with_nothing_to_send_it_is_idle() -> None:
     transmitter = Transmitter(_BITRATE_BPS)
     assert transmitter.idle
-    assert transmitter.deadline() is None
+    assert transmitter.due_at == inf
     assert transmitter.next_frame(1e9) is None
     assert transmitter.left_at == float("-inf")
 
@@ -51,7 +52,7 @@ def test_messages_leave_whole_and_in_the_order_in_which_they_were_queued() -> No
     transmitter = Transmitter(_BITRATE_BPS)
     for message in (_FIRST, _SECOND, _THIRD):
         transmitter.queue(message)
-    assert transmitter.deadline() == 0.0
+    assert transmitter.due_at == 0.0
     assert _send_all(transmitter, 0.0) == [*_FIRST, *_SECOND, *_THIRD]
     assert transmitter.idle
     assert transmitter.next_frame(0.0) is None
@@ -116,7 +117,7 @@ def test_a_frame_gap_keeps_the_frames_of_one_message_apart() -> None:
     transmitter = Transmitter(_BITRATE_BPS, frame_gap_s=0.002)
     transmitter.queue(_FIRST)
     assert _send_all(transmitter, 1.0) == _FIRST[:1]
-    assert transmitter.deadline() == pytest.approx(1.002)
+    assert transmitter.due_at == pytest.approx(1.002)
     assert transmitter.next_frame(1.0019) is None
     assert _send_all(transmitter, 1.002) == _FIRST[1:2]
     assert _send_all(transmitter, 1.5) == _FIRST[2:]
@@ -133,7 +134,7 @@ def test_a_frame_gap_does_not_part_messages() -> None:
 def test_a_message_does_not_start_before_its_time() -> None:
     transmitter = Transmitter(_BITRATE_BPS)
     transmitter.queue(_FIRST, not_before=2.0)
-    assert transmitter.deadline() == 2.0
+    assert transmitter.due_at == 2.0
     assert transmitter.next_frame(1.999) is None
     assert _send_all(transmitter, 2.0) == _FIRST
 
@@ -143,7 +144,7 @@ def test_the_time_of_a_later_message_does_not_hold_up_the_one_before() -> None:
     transmitter.queue(_FIRST)
     transmitter.queue(_SECOND, not_before=2.0)
     assert _send_all(transmitter, 0.0) == _FIRST
-    assert transmitter.deadline() == 2.0
+    assert transmitter.due_at == 2.0
     assert not transmitter.idle
     assert _send_all(transmitter, 1.9) == []
     assert _send_all(transmitter, 2.0) == _SECOND
@@ -166,7 +167,7 @@ def test_dropping_forgets_all_that_no_frame_was_sent_of() -> None:
     transmitter.queue(_SECOND)
     transmitter.drop_unstarted()
     assert transmitter.idle
-    assert transmitter.deadline() is None
+    assert transmitter.due_at == inf
     transmitter.queue(_THIRD)
     assert _send_all(transmitter, 0.0) == _THIRD
 
@@ -192,7 +193,7 @@ def test_what_follows_a_message_that_was_given_up_waits_until_its_receiver_has_d
     assert not transmitter.begun
     assert transmitter.next_frame(9.0) is None
     transmitter.queue(_SECOND)
-    assert transmitter.deadline() == 1.15
+    assert transmitter.due_at == 1.15
     assert _send_all(transmitter, 1.15) == _SECOND
 
 
@@ -201,7 +202,7 @@ def test_the_rest_of_the_last_message_is_hurried_on_without_gaps() -> None:
     transmitter.queue(_FIRST)
     assert _send_all(transmitter, 1.0) == _FIRST[:1]
     transmitter.send_without_gaps()
-    assert transmitter.deadline() == 0.0
+    assert transmitter.due_at == 0.0
     assert _send_all(transmitter, 1.0) == _FIRST[1:]
 
 
@@ -209,7 +210,7 @@ def test_a_message_that_has_not_begun_is_not_hurried_before_its_time() -> None:
     transmitter = Transmitter(_BITRATE_BPS)
     transmitter.queue(_FIRST, not_before=2.0)
     transmitter.send_without_gaps()
-    assert transmitter.deadline() == 2.0
+    assert transmitter.due_at == 2.0
 
 
 def test_dropping_nothing_is_allowed() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import random
+from math import inf
 
 from flasher.protocol.wire import Damage, DamageReason, encode, split
 from tests.loops import each
@@ -36,7 +37,7 @@ def test_the_frames_of_the_table_are_decoded(vector: Case) -> None:
     reassembler = make_reassembler(vector.message.can_id)
     assert feed_all(reassembler, vector.payloads) == [vector.message]
     assert reassembler.buffered_bytes == 0
-    assert reassembler.deadline() is None
+    assert reassembler.due_at == inf
 
 
 @every_case
