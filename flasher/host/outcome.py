@@ -220,7 +220,7 @@ def ended_before_start(
     )
 
 
-class Explanation(NamedTuple):
+class ErrorDescription(NamedTuple):
     """Error class, likely cause and remedy of an ending or a verdict."""
 
     kind: type[FlasherError]
@@ -256,7 +256,7 @@ TWO_DEVICES_REMEDY: Final = (
     "flash it, then the other one alone."
 )
 _EXPLANATIONS: Final = {
-    Ending.NO_BOOT_VERSION: Explanation(
+    Ending.NO_BOOT_VERSION: ErrorDescription(
         NoAnswerError,
         "the device has no power, sleeps, is not on this bus, the bit rate differs, or its "
         "bootloader announces itself only at power-up",
@@ -265,7 +265,7 @@ _EXPLANATIONS: Final = {
         "at power-up only is reached by flasher rescue and a power cycle.",
         code=ErrorCode.NO_BOOT_VERSION,
     ),
-    Ending.NO_ANNOUNCEMENT: Explanation(
+    Ending.NO_ANNOUNCEMENT: ErrorDescription(
         NoAnswerError,
         "it was not switched off and on, it has no power, it is not on this bus, or the bit rate "
         "differs",
@@ -273,60 +273,60 @@ _EXPLANATIONS: Final = {
         "its key or charger); --wait allows more time.",
         code=ErrorCode.NO_ANNOUNCEMENT,
     ),
-    Ending.NO_REQUEST: Explanation(
+    Ending.NO_REQUEST: ErrorDescription(
         NoAnswerError,
         "erasing takes longer than allowed, or the device refuses this size or target",
         "{again} Power-cycle the device if it stays silent.",
         code=ErrorCode.NO_REQUEST,
     ),
-    Ending.UNHEARING: Explanation(
+    Ending.UNHEARING: ErrorDescription(
         NoAnswerError,
         "it is not the target device, it refuses this size, or it does not receive",
         "Check that the device is a {node} and that the image fits it.",
         code=ErrorCode.UNHEARING,
     ),
-    Ending.WRONG_DEVICE: Explanation(
+    Ending.WRONG_DEVICE: ErrorDescription(
         WrongDeviceError,
         "the connected device is not a {node}, whose bootloader reports {boot_name} Vx.x.x",
         "Check -t/--target and what is connected; --allow-boot-name takes the device as it is.",
     ),
-    Ending.BOOT_TOO_OLD: Explanation(
+    Ending.BOOT_TOO_OLD: ErrorDescription(
         WrongDeviceError,
         "the image's manifest asks for a newer bootloader",
         "Look for an image for this bootloader. --allow-boot-version takes the device as it is.",
         code=ErrorCode.BOOT_TOO_OLD,
     ),
-    Ending.NOT_FOR_DEVICE: Explanation(
+    Ending.NOT_FOR_DEVICE: ErrorDescription(
         WrongDeviceError,
         "another file was meant, another device is connected, or the manifest is not up to date",
         "Compare the image (flasher image-info) with the device (flasher info).",
         code=ErrorCode.NOT_FOR_DEVICE,
     ),
-    Ending.NOT_TRUSTED: Explanation(
+    Ending.NOT_TRUSTED: ErrorDescription(
         WrongDeviceError,
         "an older release than the device has received: faults that were mended would come back",
         "Take the newest release of the maker.",
         code=ErrorCode.NOT_TRUSTED,
     ),
-    Ending.IMPLAUSIBLE: Explanation(
+    Ending.IMPLAUSIBLE: ErrorDescription(
         ImageError,
         LIKELY_CAUSES,
         "Name the firmware file itself; flasher image-info shows what is in a file.",
         code=ErrorCode.IMAGE_IMPLAUSIBLE,
     ),
-    Ending.UNCHECKED: Explanation(
+    Ending.UNCHECKED: ErrorDescription(
         WrongDeviceError,
         "no application runs on the device, or it has no query for a value of the manifest",
         "Look at the device's label, then waive the check; flasher rescue goes on without it.",
         code=ErrorCode.UNCHECKED,
     ),
-    Ending.IN_USE: Explanation(
+    Ending.IN_USE: ErrorDescription(
         WrongDeviceError,
         "the bike is being ridden, or a load draws current",
         "Let it stand still and switch its loads off. --allow-in-use upgrades it all the same.",
         code=ErrorCode.VEHICLE_IN_USE,
     ),
-    Ending.LOW_CHARGE: Explanation(
+    Ending.LOW_CHARGE: ErrorDescription(
         WrongDeviceError,
         "it was used or stored without being charged; an empty battery switches itself off, in the "
         "middle of its upgrade too",
@@ -334,19 +334,19 @@ _EXPLANATIONS: Final = {
         "--allow-low-charge upgrades it all the same.",
         code=ErrorCode.LOW_CHARGE,
     ),
-    Ending.SECOND_TOOL: Explanation(
+    Ending.SECOND_TOOL: ErrorDescription(
         BusError,
         "another program or dongle speaks as the CAN dongle (CDL) on this bus",
         "End the other tool and disconnect it. {again}",
         code=ErrorCode.SECOND_TOOL,
     ),
-    Ending.TWO_DEVICES: Explanation(
+    Ending.TWO_DEVICES: ErrorDescription(
         WrongDeviceError,
         TWO_DEVICES_CAUSE,
         "Disconnect one of them. {again}",
         code=ErrorCode.TWO_DEVICES,
     ),
-    Ending.PACKET_FAILED: Explanation(
+    Ending.PACKET_FAILED: ErrorDescription(
         TransferError,
         "the device lost power or contact, the line is disturbed, or the device cannot store this "
         "packet",
@@ -354,36 +354,36 @@ _EXPLANATIONS: Final = {
         "power cycle.",
         code=ErrorCode.PACKET_FAILED,
     ),
-    Ending.RESTARTED: Explanation(
+    Ending.RESTARTED: ErrorDescription(
         TransferError,
         "its supply drops, its watchdog resets it, it refuses a packet, or two devices "
         "of the same kind answer",
         "Check the supply, and that there is one {node} only. {again}",
         code=ErrorCode.RESTARTED,
     ),
-    Ending.BROKEN_PROTOCOL: Explanation(
+    Ending.BROKEN_PROTOCOL: ErrorDescription(
         TransferError,
         "its bootloader does not follow the protocol",
         "Report the boot version to its maker. {again}",
         code=ErrorCode.BROKEN_PROTOCOL,
     ),
-    Ending.REFUSED: Explanation(
+    Ending.REFUSED: ErrorDescription(
         RefusedError,
         "the image is not meant for this device, or the checksum that it carries is wrong",
         "Look at the image (flasher image-info) and flash one that the device accepts.",
     ),
-    Ending.UNCONFIRMED: Explanation(
+    Ending.UNCONFIRMED: ErrorDescription(
         UnconfirmedError,
         "the answer was lost, or the device restarted without sending it",
         "Unconfirmed is not complete: check whether the new application runs, or flash again.",
     ),
-    Ending.OTHER_VERSION: Explanation(
+    Ending.OTHER_VERSION: ErrorDescription(
         VerificationError,
         "the device runs another image than the one sent, or the image names its version wrongly",
         "Compare with flasher image-info, then flash the right image.",
         code=ErrorCode.OTHER_VERSION,
     ),
-    Ending.CANCELLED: Explanation(
+    Ending.CANCELLED: ErrorDescription(
         InterruptedByUserError,
         "",
         "{again} A bootloader that was receiving may need some seconds to time out first.",
@@ -393,8 +393,8 @@ _NO_SESSION_EITHER: Final = _EXPLANATIONS[Ending.NO_BOOT_VERSION]._replace(
     remedy="Check supply, wiring, termination and bit rate (flasher doctor), then reach the device "
     "by flasher rescue and a power cycle."
 )
-"""Explanation for a device that was silent to the update command as well (R26)."""
-_ANSWERED_OTHERWISE: Final = Explanation(
+"""ErrorDescription for a device that was silent to the update command as well (R26)."""
+_ANSWERED_OTHERWISE: Final = ErrorDescription(
     TransferError,
     "its bootloader numbers packets in another way than table 9 (two bytes, the low one first) or "
     "answers them with another message, or an application runs again",
@@ -402,7 +402,7 @@ _ANSWERED_OTHERWISE: Final = Explanation(
     code=ErrorCode.PACKET_FAILED,
 )
 _APPLICATION_RUNS: Final = {
-    Ending.NO_BOOT_VERSION: Explanation(
+    Ending.NO_BOOT_VERSION: ErrorDescription(
         NoAnswerError,
         "its application runs: it ignores the reset in its state, its profile needs another "
         "reset_command, its announcement was lost, or its bootloader announces itself only at "
@@ -410,7 +410,7 @@ _APPLICATION_RUNS: Final = {
         "{again} If it does not help, flasher rescue and a power cycle reach its bootloader.",
         code=ErrorCode.NO_BOOT_VERSION,
     ),
-    Ending.NO_ANNOUNCEMENT: Explanation(
+    Ending.NO_ANNOUNCEMENT: ErrorDescription(
         NoAnswerError,
         "its application runs: it was not switched off and on, or its bootloader does not announce "
         "itself at power-up",
@@ -421,7 +421,7 @@ _APPLICATION_RUNS: Final = {
 """Explanations for a device whose application sent something shortly before."""
 
 
-_TWO_PERHAPS_ERASED: Final = Explanation(
+_TWO_PERHAPS_ERASED: Final = ErrorDescription(
     WrongDeviceError, TWO_DEVICES_CAUSE, TWO_DEVICES_REMEDY, code=ErrorCode.TWO_DEVICES
 )
 
@@ -437,24 +437,24 @@ def image_refused(ending: Ending, target: Target, detail: str) -> FlasherError:
     return explained.error(ending, target, detail)
 
 
-def _late(phase: Phase, left: DeviceLeft) -> Explanation:
+def _late(phase: Phase, left: DeviceLeft) -> ErrorDescription:
     """Explain a missed deadline by the phase that was reached."""
     remedy = "Allow more time with --timeout, or find what is slow. {again}"
     match phase:
         case Phase.LISTEN | Phase.IDENTIFY | Phase.RESET | Phase.BOOT | Phase.UPDATE:
             cause = "the device is not there, or not ready in the time allowed"
-            return Explanation(NoAnswerError, cause, remedy)
+            return ErrorDescription(NoAnswerError, cause, remedy)
         case Phase.END if left is not DeviceLeft.UNKNOWN:
             cause = "no time was left to send end of transfer"
-            return Explanation(TransferError, cause, remedy)
+            return ErrorDescription(TransferError, cause, remedy)
         case Phase.TRANSFER:
             cause = (
                 "the device lost power or contact, it answers late again and again, or the bus is "
                 "congested"
             )
-            return Explanation(TransferError, cause, remedy)
+            return ErrorDescription(TransferError, cause, remedy)
         case Phase.END | Phase.CONFIRM:
             cause = "the final answer did not come in the time allowed"
-            return Explanation(UnconfirmedError, cause, remedy)
+            return ErrorDescription(UnconfirmedError, cause, remedy)
         case _:
             assert_never(phase)

@@ -27,7 +27,7 @@ from flasher.host.outcome import (
     TWO_DEVICES_CAUSE,
     TWO_DEVICES_REMEDY,
     DeviceLeft,
-    Explanation,
+    ErrorDescription,
     with_device_state,
 )
 from flasher.host.query import READ_MEMORY, Query, ask, count_answers, memory_bytes, memory_requests
@@ -85,19 +85,19 @@ GOOD: Final = frozenset(
 )
 
 
-_OTHER_IMAGE: Final = Explanation(
+_OTHER_IMAGE: Final = ErrorDescription(
     VerificationError,
     "the device runs another image, or fell back to an older one",
     "Power-cycle the device and look at it with flasher info; then flash the right image.",
 )
 _EXPLANATIONS: Final = {
-    Verdict.INTERRUPTED: Explanation(
+    Verdict.INTERRUPTED: ErrorDescription(
         InterruptedByUserError, "", "Show its version with flasher info."
     ),
-    Verdict.TWO_DEVICES: Explanation(
+    Verdict.TWO_DEVICES: ErrorDescription(
         WrongDeviceError, TWO_DEVICES_CAUSE, TWO_DEVICES_REMEDY, code=ErrorCode.TWO_DEVICES
     ),
-    Verdict.OTHER_UNIT: Explanation(
+    Verdict.OTHER_UNIT: ErrorDescription(
         WrongDeviceError,
         "the unit was exchanged during the upgrade, or the new firmware reports "
         "another serial number",
@@ -105,20 +105,20 @@ _EXPLANATIONS: Final = {
         "alone, look at it with flasher info, then at the other one.",
         code=ErrorCode.OTHER_UNIT,
     ),
-    Verdict.SECOND_TOOL: Explanation(
+    Verdict.SECOND_TOOL: ErrorDescription(
         BusError,
         "another program or dongle speaks as the CAN dongle (CDL) on this bus",
         "End the other tool, then look at the device with flasher info.",
         code=ErrorCode.SECOND_TOOL,
     ),
-    Verdict.IN_BOOTLOADER: Explanation(
+    Verdict.IN_BOOTLOADER: ErrorDescription(
         VerificationError,
         "the device does not start the image that it confirmed, or a second device "
         "of its kind has lost its application",
         "Leave one {node} alone on the bus, then flash it again.",
         code=ErrorCode.IN_BOOTLOADER,
     ),
-    Verdict.NO_ANSWER: Explanation(
+    Verdict.NO_ANSWER: ErrorDescription(
         VerificationError,
         "the application starts slowly (application_start_timeout_s of a profile), does "
         "not know the query, or does not start",
