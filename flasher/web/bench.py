@@ -562,7 +562,7 @@ class BenchController:
         finally:
             self._expected_serial, self._other_serial = "", None
         if other is not None and isinstance(carried.error, InterruptedByUserError):
-            carried.error = WrongDeviceError(
+            error = WrongDeviceError(
                 text(
                     "The unit {other} answers now, and {serial} answered before: nothing was "
                     "written.",
@@ -572,14 +572,15 @@ class BenchController:
                 remedy=text("Leave one unit connected until its upgrade has ended."),
                 code=ErrorCode.NOT_FOR_DEVICE,
             )
+            carried = replace(carried, error=error)
         if carried.error is not None:
             again = RESCUE if carried.error.needs_rescue else _AGAIN
             advise(carried.error, again, AGAIN)
         state = self.state
         before = None if state.is_rescue else state.bike  # a bootloader does not report its unit
         done = Done(
-            self.date(), adapter, job.plan.target, offer, state.checks, before, state.furthest,
-            carried.result, carried.error, carried.bundle, warning=carried.warning,
+            **vars(carried), at=self.date(), adapter=adapter, target=job.plan.target, offer=offer,
+            checks=state.checks, before=before, packet=state.furthest,
         )  # fmt: skip
         self.show(done=done, power_cycle_s=None, adapter_left_s=None, phase=None)
         is_new = carried.result is not None and carried.result.outcome.ok

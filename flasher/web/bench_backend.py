@@ -4,28 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, Unpack
 
-from flasher.api import CallOptions, Connection, Job, Result
-from flasher.errors import FlasherError
+from flasher.api import CallOptions, Connection, Job
 from flasher.history import Flash
 from flasher.protocol.spec import Dialect, Target
 from flasher.settings.area import Area
 from flasher.settings.profile import Profile
-from flasher.web.bench_state import Adapter, Saved
-
-
-@dataclass
-class UpgradeEnding:
-    """End of an upgrade: result or error, bundle and entry in the history."""
-
-    result: Result | None
-    error: FlasherError | None
-    bundle: Path | None
-    warning: str = ""
-    """Reason why the history lacks the upgrade; "" if it has it."""
+from flasher.web.bench_state import Adapter, Saved, UpgradeEnding
 
 
 class BenchBackend(Protocol):

@@ -73,7 +73,19 @@ class Offer:
 
 
 @dataclass(frozen=True)
-class Done:
+class UpgradeEnding:
+    """End of an upgrade: result or error, bundle and entry in the history."""
+
+    result: Result | None
+    """None if the adapter failed or a user ended the upgrade at once."""
+    error: FlasherError | None
+    bundle: Path | None
+    warning: str = ""
+    """Reason why the history lacks the upgrade; "" if it has it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Done(UpgradeEnding):
     """A finished upgrade. Transferred, completed and running are separate facts; None: unknown."""
 
     at: datetime
@@ -84,13 +96,7 @@ class Done:
     before: DeviceInfo | None
     packet: int
     """Number of packets that the device acknowledged in the best attempt."""
-    result: Result | None
-    """None if the adapter failed or a user ended the upgrade at once."""
-    error: FlasherError | None
-    bundle: Path | None
     after: DeviceInfo | None = None
-    warning: str = ""
-    """Reason why the history lacks the upgrade; "" if it has it."""
 
     @property
     def is_transferred(self) -> bool | None:

@@ -24,10 +24,9 @@ from flasher.settings.manifest import manifest_path, to_toml
 from flasher.web.archive import PAGES as KEPT
 from flasher.web.archive import Archive
 from flasher.web.bench import BenchController, Order
-from flasher.web.bench_backend import UpgradeEnding
 from flasher.web.bench_compare import watch_compared
 from flasher.web.bench_page import UPLOADS, BenchPage, Shelf
-from flasher.web.bench_state import Adapter, BenchState
+from flasher.web.bench_state import Adapter, BenchState, UpgradeEnding
 from flasher.web.guard import BrowserEntry, application
 from flasher.web.pages import Pages
 from flasher.web.query_processes import Answer, Question, answer_routes

@@ -13,9 +13,8 @@ from flasher.errors import BusError, ErrorCode
 from flasher.protocol.engine import Tap
 from flasher.protocol.spec import BMS, Target
 from flasher.web.bench import BenchController
-from flasher.web.bench_backend import UpgradeEnding
 from flasher.web.bench_bike import upgrade_bike
-from flasher.web.bench_state import Activity, Adapter, BenchState
+from flasher.web.bench_state import Activity, Adapter, BenchState, UpgradeEnding
 from flasher.web.virtual_bike import BikeFault
 from tests.end_to_end.stage import NEW, image_of
 from tests.loops import each

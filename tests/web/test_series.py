@@ -20,8 +20,7 @@ from flasher.protocol.engine import Tap
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WELLING, Target
 from flasher.web.bench import BenchController
-from flasher.web.bench_backend import UpgradeEnding
-from flasher.web.bench_state import Activity, BenchState, Series, SeriesStep
+from flasher.web.bench_state import Activity, BenchState, Series, SeriesStep, UpgradeEnding
 from flasher.web.series import SHOWN_S, take_next_bikes
 from flasher.web.virtual_bike import BikeFault, VirtualBike
 from tests.loops import each

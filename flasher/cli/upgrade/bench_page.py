@@ -43,10 +43,9 @@ from flasher.settings.profile import Profile, load_profile
 from flasher.web.archive import PAGES as KEPT
 from flasher.web.archive import Archive
 from flasher.web.bench import BenchController
-from flasher.web.bench_backend import UpgradeEnding
 from flasher.web.bench_compare import watch_compared
 from flasher.web.bench_page import UPLOADS, BenchPage, Shelf
-from flasher.web.bench_state import Activity, Adapter, Saved
+from flasher.web.bench_state import Activity, Adapter, Saved, UpgradeEnding
 from flasher.web.guard import BrowserEntry, application
 from flasher.web.pages import Pages
 from flasher.web.query_processes import QueryProcesses, answer_routes
