@@ -16,7 +16,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import can
@@ -563,6 +563,26 @@ def test_a_back_end_that_waits_or_is_none_of_these_is_only_silent(
     link = CanLink(bus, interface)
     for turn in range(200):
         assert link.receive(0.1 * turn) is None
+
+
+@each("at_once, is_lost", [(60, True), (10, False)])
+def test_a_computer_that_stalls_does_not_hide_a_lost_adapter(
+    bus: FakeBus, monkeypatch: pytest.MonkeyPatch, at_once: int, is_lost: bool
+) -> None:
+    """Between two calls that take 20 ms, a lost adapter returns at once many times; one that waits
+    does so a few times.
+    """
+    now, calls = [0.0], itertools.count(1)
+
+    def receive(_timeout: float | None) -> tuple[None, bool]:
+        now[0] += 0.0001 if next(calls) % (at_once + 1) else 0.02
+        return None, False
+
+    monkeypatch.setattr("flasher.bus.adapter.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr(bus, "_recv_internal", receive)
+    link = CanLink(bus, "socketcand")
+    with pytest.raises(BusError, match="returns at once") if is_lost else nullcontext():
+        link.receive(10.0)
 
 
 # -- a full serial port ---------------------------------------------------------------------------
