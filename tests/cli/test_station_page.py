@@ -83,10 +83,12 @@ def resumed(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
             with suppress(httpx2.HTTPError), client.stream("GET", f"{url}line/events") as stream:
                 for line in stream.iter_lines():
                     if line.startswith("data: ") and not reasons:
-                        head = json.loads(line.removeprefix("data: ")).get("head") or {}
+                        message = json.loads(line.removeprefix("data: "))
+                        head = message.get("head") or {}
                         if head.get("stopped"):
                             reasons.append(head["stopped"]["reason"])
-                            client.post(f"{url}line/scan", json={"text": "RESUME"}, headers=headers)
+                            scan = {"text": "RESUME", "shown_at": message["at"]}
+                            client.post(f"{url}line/scan", json=scan, headers=headers)
 
     monkeypatch.setattr(pages, "Server", Watched)
     yield reasons
