@@ -36,7 +36,7 @@ HOLDERS: Final = {
     "R3": ("tests/host/test_product.py::test_the_products_own_reset_is_sent",),
     "R4": ("tests/image/test_plan.py::test_a_packet_number_is_little_endian",),
     "R5": (
-        "tests/mock/test_bms.py::test_memory_reads_give_the_application_as_it_stands_in_the_flash",
+        "tests/mock/test_bms.py::test_memory_reads_give_the_application_of_the_flash",
         "tests/api/test_requests.py::test_memory_is_read_in_pieces_of_128_bytes",
     ),
     "R6": ("tests/host/test_end.py::test_a_second_nak_whatever_its_number_means_refused",),
@@ -55,7 +55,7 @@ HOLDERS: Final = {
     "R10": (
         (
             "tests/host/test_transfer.py::"
-            "test_nak_n_plus_1_for_a_repeated_packet_counts_only_where_the_profile_says_so"
+            "test_nak_n_plus_1_for_a_repeated_packet_counts_only_where_the_profile_allows_it"
         ),
     ),
     "R11": (
@@ -103,7 +103,7 @@ HOLDERS: Final = {
     "R23": (
         (
             "tests/mock/test_bms_alone.py::"
-            "test_shutdown_is_repeated_every_200_ms_until_1_s_when_nobody_answers_then_it_is_off"
+            "test_shutdown_is_repeated_every_200_ms_until_1_s_when_no_device_answers_then_it_is_off"
         ),
     ),
     "R24": (
@@ -123,7 +123,7 @@ HOLDERS: Final = {
     "R27": (
         (
             "tests/host/test_session_stages.py::"
-            "test_two_devices_that_tell_different_versions_are_refused_before_the_reset"
+            "test_two_devices_that_report_different_versions_are_refused_before_the_reset"
         ),
         (
             "tests/host/test_duplicates.py::"

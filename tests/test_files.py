@@ -93,7 +93,7 @@ def test_a_file_of_the_largest_size_is_read(tmp_path: Path) -> None:
         read(path, 7)
 
 
-def test_no_profile_is_looked_for_where_that_is_said(
+def test_no_profile_is_looked_for_where_that_is_asked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "flasher.toml").write_text("attempts = 9\n")

@@ -18,7 +18,7 @@ sys.exit(not {signal.SIGINT, signal.SIGHUP, signal.SIGTERM} <= blocked)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no Ctrl-C to a single process")
-def test_a_process_hears_no_ctrl_c_from_its_first_line_on_and_its_parent_hears_it_again() -> None:
+def test_a_process_gets_no_ctrl_c_from_its_first_line_on_and_its_parent_gets_it_again() -> None:
     heard: list[int] = []
     before = signal.signal(signal.SIGINT, lambda number, _frame: heard.append(number))
     try:

@@ -67,7 +67,7 @@ def test_without_a_file_everything_is_a_default_or_the_documents(tmp_path: Path)
     assert profile.sources["timings.ack_timeout_s"] == "default"
 
 
-def test_a_file_tells_its_path_as_the_source_of_its_values_only(tmp_path: Path) -> None:
+def test_a_file_names_its_path_as_the_source_of_its_values_only(tmp_path: Path) -> None:
     path = written(tmp_path, "attempts = 7\n[timings]\nack_timeout_s = 1\n")
     profile = load_profile(path, WMC)
     assert profile.attempts == 7
@@ -272,13 +272,13 @@ def test_values_that_do_not_fit_together_are_refused(tmp_path: Path, text: str, 
     assert said in refused(tmp_path, text).what
 
 
-def test_what_is_no_toml_is_told_with_its_line(tmp_path: Path) -> None:
+def test_what_is_no_toml_is_reported_with_its_line(tmp_path: Path) -> None:
     error = refused(tmp_path, "attempts 3\n")
     assert "is not a readable TOML file" in error.what
     assert "line 1" in error.what
 
 
-def test_bytes_that_are_no_text_are_told(tmp_path: Path) -> None:
+def test_bytes_that_are_no_text_are_reported(tmp_path: Path) -> None:
     path = tmp_path / "flasher.toml"
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(UsageError, match="is not a readable TOML file"):
@@ -354,7 +354,7 @@ def test_the_users_directory_is_the_systems_own(
     assert looked_at == [Path("/here/flasher.toml"), Path(expected, "flasher.toml")]
 
 
-def test_all_faults_are_told_at_once(tmp_path: Path) -> None:
+def test_all_faults_are_reported_at_once(tmp_path: Path) -> None:
     error = refused(
         tmp_path,
         'atempts = 1\nframe_gap_s = -1\n[timings]\npacket_tries = 0\n[wmc]\ncpu = "cortex"\n'

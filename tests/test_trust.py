@@ -222,7 +222,7 @@ def test_a_file_that_no_trace_can_be_written_to_is_neither_made_nor_emptied(
 
 
 @pytest.mark.slow
-def test_what_a_device_told_is_its_owners(
+def test_what_a_device_reported_is_its_owners(
     flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Log, trace, bundle, history, backup, memory, exports."""

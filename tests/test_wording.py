@@ -42,6 +42,6 @@ def test_nothing_else_is_in_the_catalogue() -> None:
     assert wording._EXPLANATIONS.keys() <= {cause.value for cause in Cause}
 
 
-def test_a_word_that_is_not_known_stands_for_itself() -> None:
+def test_a_word_that_is_not_known_stays_itself() -> None:
     assert wording.wording_of("DamageReason", "bad_crc") == "wrong CRC"
     assert wording.wording_of("DamageReason", "cut short") == "cut short"

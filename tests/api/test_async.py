@@ -46,7 +46,7 @@ def test_a_device_is_flashed_while_the_event_loop_goes_on() -> None:
     assert packets == list(range(1, 1 + result.outcome.total_packets))
 
 
-def test_what_the_loop_is_told_is_what_the_blocking_device_tells() -> None:
+def test_the_loop_gets_what_the_blocking_device_gets() -> None:
     told: dict[str, list[object]] = {"blocking": [], "async": []}
     with flasher.connect_mock("bms", speed=0) as connection:
         connection.device("bms").flash(IMAGE, on_event=told["blocking"].append)

@@ -28,7 +28,7 @@ def test_a_class_that_several_items_have_is_asked_for_by_name() -> None:
     assert "user-string-1, user-string-2, user-string-3" in caught.value.remedy
 
 
-def test_a_class_that_nobody_can_ask_for_is_refused() -> None:
+def test_a_class_without_a_query_is_refused() -> None:
     with pytest.raises(UsageError, match="Faults is the content of no items of the BMS"):
         wire_to(Battery()).device().read(contents.Faults)
 
@@ -39,7 +39,7 @@ def test_the_version_is_that_of_the_document() -> None:
     assert str(version.hardware_version) == "V1r2r0_20220512"
 
 
-def test_a_target_without_a_version_query_says_so() -> None:
+def test_a_target_without_a_version_query_is_named() -> None:
     with pytest.raises(NoAnswerError, match="wmc cannot be asked for its version"):
         wire_to().device("wmc").version()
 

@@ -96,7 +96,7 @@ def test_events_arrive_in_order_while_it_runs() -> None:
 
 
 @pytest.mark.slow
-def test_the_mock_takes_the_time_of_a_real_bus_unless_told_otherwise() -> None:
+def test_the_mock_takes_the_time_of_a_real_bus_unless_set_otherwise() -> None:
     began = time.perf_counter()
     outcome = flasher.flash(IMAGE, "bms", mock=True).outcome
     assert time.perf_counter() - began >= outcome.statistics.duration_s * 0.99
@@ -235,7 +235,7 @@ def test_the_version_decides_when_the_final_answer_is_lost(
         assert error is None
 
 
-def test_a_cancelled_upgrade_is_an_outcome_that_says_what_is_left() -> None:
+def test_a_cancelled_upgrade_is_an_outcome_that_states_what_is_left() -> None:
     acknowledged: list[object] = []
 
     def note(event: object) -> None:
@@ -470,7 +470,7 @@ def test_everything_that_the_tour_exports_is_there() -> None:
 # -- the battery's own data -----------------------------------------------------------------------
 
 
-def test_a_program_reads_and_writes_what_the_battery_says_of_itself() -> None:
+def test_a_program_reads_and_writes_what_the_battery_states_of_itself() -> None:
     with flasher.connect_mock("bms", speed=0) as connection:
         running = connection.device().read("running-information")
         assert isinstance(running, contents.RunningInformation)

@@ -225,7 +225,7 @@ def test_info_asks_everything_that_the_tool_may_ask(dialect: Dialect) -> None:
     assert found.survey.faults is None
 
 
-def test_info_hears_faults() -> None:
+def test_info_shows_faults() -> None:
     found = wire_to(Battery(repeats=(FAULTS,))).device().identify()
     assert found.survey.faults is not None
     assert found.survey.faults.faults == (
@@ -234,7 +234,7 @@ def test_info_hears_faults() -> None:
     )
 
 
-def test_info_of_a_device_that_answers_half_is_bounded_and_says_what_is_missing() -> None:
+def test_info_of_a_device_that_answers_half_is_bounded_and_states_what_is_missing() -> None:
     silent = frozenset(list(ANSWERS)[::2])
     wire = wire_to(Battery(silent=silent, delay_s=0.3))
     found = wire.device().identify()
@@ -262,7 +262,7 @@ def test_info_does_not_ask_into_the_dialogue_of_another_tool() -> None:
         ),
     ],
 )
-def test_nobody_asks_or_writes_before_having_listened_for_another_tool(
+def test_no_command_asks_or_writes_before_it_has_listened_for_another_tool(
     ask: Callable[[Any], object],
 ) -> None:
     battery, tool = Battery(), Battery(silent=SILENT, repeats=((0x751, 0xA401, b"\x04"),))
@@ -314,7 +314,7 @@ def test_scan_finds_who_talks_and_who_answers() -> None:
         ((0x725, 0xC109, b"BMSV1.2.3"), WELLING),
     ],
 )
-def test_traffic_of_one_dialect_only_tells_it(
+def test_traffic_of_one_dialect_only_decides_it(
     report: tuple[int, int, bytes], dialect: Dialect
 ) -> None:
     survey = wire_to(Battery(silent=SILENT, repeats=(report,))).scan()

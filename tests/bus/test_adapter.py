@@ -147,7 +147,7 @@ def test_only_a_serial_adapter_gets_a_send_timeout(bus: FakeBus) -> None:
 # -- receiving ------------------------------------------------------------------------------------
 
 
-def test_the_kinds_of_frames_are_told_apart(bus: FakeBus) -> None:
+def test_the_kinds_of_frames_are_distinguished(bus: FakeBus) -> None:
     bus.inbox.extend(
         [
             message(0x725, b"\x01\x02"),
@@ -484,7 +484,7 @@ def test_listening_only_is_asked_for_in_the_back_ends_own_words(
         (FileNotFoundError(errno.ENOENT, "no file"), "another name", "`flasher adapters`"),
     ],
 )
-def test_why_it_cannot_be_opened_is_found_behind_the_back_ends_own_error(
+def test_why_it_cannot_be_opened_is_found_past_the_back_ends_own_error(
     monkeypatch: pytest.MonkeyPatch, error: Exception, cause: str, remedy: str
 ) -> None:
     def fail(**_config: Any) -> can.BusABC:
@@ -554,7 +554,7 @@ NO_ACK = error_message(0x204, "00 20 00 00 00 00 80 00")
 BUS_OFF = error_message(0x040, "00 00 00 00 00 00 00 00")
 
 
-def test_frames_that_nobody_acknowledges_are_noticed(bus: FakeBus) -> None:
+def test_frames_that_no_node_acknowledges_are_noticed(bus: FakeBus) -> None:
     bus.inbox.append(NO_ACK)
     link = CanLink(bus, "gs_usb", "0")
     link.send(FRAME)
@@ -692,7 +692,7 @@ def test_an_adapter_that_refuses_frame_after_frame_is_lost(slcan: SlcanBus) -> N
 @each(
     "answers, received, is_bad", [("aa", False, True), ("a\r", False, False), ("aa", True, False)]
 )
-def test_a_silent_bus_behind_an_adapter_that_refuses_most_frames_is_not_the_devices_fault(
+def test_a_silent_bus_with_an_adapter_that_refuses_most_frames_is_not_the_devices_fault(
     slcan: SlcanBus, answers: str, *, received: bool, is_bad: bool
 ) -> None:
     link = CanLink(slcan, "slcan")
@@ -720,7 +720,7 @@ def test_a_silent_bus_behind_an_adapter_that_refuses_most_frames_is_not_the_devi
         ("udp_multicast", None, True, True),
     ],
 )
-def test_an_echo_is_told_from_a_second_tool_by_what_the_back_end_knows(
+def test_an_echo_is_distinguished_from_a_second_tool_by_what_the_back_end_knows(
     interface: str, asked: bool | None, *, is_rx: bool, is_echo: bool
 ) -> None:
     """The frame is the very same one that this link has sent."""

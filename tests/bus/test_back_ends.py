@@ -482,7 +482,7 @@ def test_a_message_that_no_frame_can_be_is_unreadable(bus: FakeBus, bad: can.Mes
     assert link.health().frames_received == 1
 
 
-def test_data_behind_the_end_of_a_frame_are_none(bus: FakeBus) -> None:
+def test_data_after_the_end_of_a_frame_do_not_count(bus: FakeBus) -> None:
     """canalystii delivers eight bytes, however many the frame has."""
     bus.inbox.extend(
         [
@@ -495,7 +495,7 @@ def test_data_behind_the_end_of_a_frame_are_none(bus: FakeBus) -> None:
     assert link.receive(AT_ONCE) == Frame(0x725, bytes(range(8)))
 
 
-def test_an_answer_behind_a_damaged_line_is_received_before_its_time_is_over(bus: FakeBus) -> None:
+def test_an_answer_after_a_damaged_line_is_received_before_its_time_is_over(bus: FakeBus) -> None:
     """After a stall of the computer: what waits is received at once, and drained."""
     link = CanLink(bus, "slcan")
     bus.inbox.extend([ValueError("bad line"), message(0x7FF, bytes(12), is_fd=True), message()])
@@ -523,7 +523,7 @@ def test_a_state_that_is_reported_again_and_again_is_no_frame_to_wait_for(bus: F
     assert link.health().error_frames == 3 * adapter._UNREADABLE_LIMIT
 
 
-def test_the_words_of_the_driver_are_told_behind_those_of_python_can(bus: FakeBus) -> None:
+def test_the_words_of_the_driver_are_reported_after_those_of_python_can(bus: FakeBus) -> None:
     bus.inbox.append(wrapped(Op(READ_FAILED), SERIAL_GONE))
     with pytest.raises(BusError, match="serial device: device reports readiness"):
         CanLink(bus, "slcan").receive(AT_ONCE)
@@ -749,7 +749,7 @@ def test_a_socketcand_that_sends_nonsense_or_is_gone_is_lost() -> None:
         assert caught.value.code is LOST
 
 
-def test_a_socketcand_that_greets_nobody_ends_in_bounded_time(
+def test_a_socketcand_that_does_not_greet_ends_in_bounded_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("flasher.bus.opening._ANSWER_LIMIT_S", 0.05)
@@ -767,7 +767,9 @@ def test_a_socketcand_that_greets_nobody_ends_in_bounded_time(
         gc.collect()
 
 
-def test_a_controller_that_is_off_by_exception_is_told_as_by_an_error_frame(bus: FakeBus) -> None:
+def test_a_controller_that_is_off_by_exception_is_reported_as_by_an_error_frame(
+    bus: FakeBus,
+) -> None:
     bus.inbox.append(Op("Bus off status"))
     link = CanLink(bus, "ixxat")
     with pytest.raises(BusError):

@@ -38,7 +38,7 @@ def kernel_has(monkeypatch: pytest.MonkeyPatch, bitrate_bps: int | None) -> None
     monkeypatch.setattr("flasher.bus.bit_rate.read_interface", lambda _name: seen)
 
 
-def test_the_dialects_holds_where_nobody_says_anything() -> None:
+def test_the_dialect_holds_where_no_device_answers() -> None:
     assert api.bit_rate("welling", **PCAN) == BitRate(250_000, "the dialect's")
     assert api.bit_rate("motinova", **CAN0) == BitRate(125_000, "the dialect's")
     assert api.bit_rate() == BitRate(250_000, "the dialect's")

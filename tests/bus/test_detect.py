@@ -55,14 +55,14 @@ def test_one_that_crashes_does_not_take_the_others_with_it() -> None:
     assert detected.hung == []
 
 
-def test_a_failure_and_odd_output_are_told_from_answers() -> None:
+def test_a_failure_and_odd_output_are_distinguished_from_answers() -> None:
     with Detection(["fails", "talks", "good"], command=COMMAND, limit_s=20.0) as detection:
         detected = detection.collect()
     assert [found.arguments for found in detected.found] == ["-i good -c ch0"]
     assert detected.failed["fails"] == "OSError: no driver"
 
 
-def test_no_process_is_left_when_nobody_collects() -> None:
+def test_no_process_is_left_when_no_one_collects() -> None:
     with Detection(["hangs"], command=COMMAND, limit_s=20.0) as detection:
         process = detection._processes[0][1]
         assert process.poll() is None
@@ -106,7 +106,7 @@ def test_the_real_process_answers_for_python_cans_back_ends(
     ]
 
 
-def test_a_back_end_that_can_list_nothing_is_told_from_one_that_finds_nothing() -> None:
+def test_a_back_end_that_can_list_nothing_is_distinguished_from_one_that_finds_nothing() -> None:
     child = """
 for name, sees in (("a", "cannot_tell"), ("b", "not_loaded"), ("c", "")):
     print('detected: {"interface": "%s", "channels": [], "sees": "%s", "error": ""}' % (name, sees))
@@ -130,7 +130,7 @@ def test_the_kernels_interfaces_are_found_up_or_down(
         assert detection.collect().found == [DetectedAdapter("socketcan", "can0")]
 
 
-def test_a_serial_port_is_one_with_what_its_usb_device_says(
+def test_a_serial_port_is_one_with_its_usb_device(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     port = SimpleNamespace(

@@ -143,7 +143,7 @@ def test_everything_that_waits_is_received_before_a_due_tick(
     ]
 
 
-def test_a_stall_behind_the_last_poll_does_not_make_a_tick_late(clock: VirtualClock) -> None:
+def test_a_stall_after_the_last_poll_does_not_make_a_tick_late(clock: VirtualClock) -> None:
     """What comes while the computer stands still is heard before a timer that ran out then."""
 
     class StallingLink(FakeLink):
@@ -219,7 +219,7 @@ def test_a_deadline_that_begins_when_a_frame_has_left_is_kept(
     assert engine.calls == [("sent 752", 0.0), ("tick", 0.03)]
 
 
-def test_frames_go_out_one_at_a_time_and_the_engine_is_told_when_each_was_accepted(
+def test_frames_go_out_one_at_a_time_and_the_engine_learns_when_each_was_accepted(
     clock: VirtualClock, link: FakeLink
 ) -> None:
     engine = Recorder()

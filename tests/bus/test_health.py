@@ -55,7 +55,7 @@ def test_linux_error_frames(can_id: int, data: str, kind: TroubleKind, words: st
     assert words in trouble.words
 
 
-def test_error_counters_are_told_only_when_the_frame_has_them() -> None:
+def test_error_counters_are_reported_only_when_the_frame_has_them() -> None:
     assert (linux(0x204, "00 20 00 00 00 00 80 07").tx_errors) == 0x80
     assert (linux(0x204, "00 20 00 00 00 00 80 07").rx_errors) == 7
     # An older kernel fills them without the class bit.
@@ -171,7 +171,7 @@ def test_bus_off_is_a_failure_whatever_was_sent() -> None:
     assert "bus-off" in error.cause
 
 
-def test_what_the_adapter_says_itself_counts_more_than_error_frames() -> None:
+def test_what_the_adapter_reports_itself_counts_more_than_error_frames() -> None:
     health = keeper(PASSIVE).health(ControllerState.BUS_OFF, 248, 3)
     assert health.state is ControllerState.BUS_OFF
     assert (health.tx_errors, health.rx_errors) == (248, 3)

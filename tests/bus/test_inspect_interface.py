@@ -81,7 +81,7 @@ def says(*links: dict[str, Any]) -> Any:
     return run
 
 
-def test_everything_that_ip_tells(sysfs: Path) -> None:
+def test_everything_that_ip_reports_is_used(sysfs: Path) -> None:
     assert read_interface("can0", run=says(CAN0), sysfs=sysfs) == Interface(
         name="can0",
         is_can=True,
@@ -150,7 +150,9 @@ def test_bus_off_takes_the_carrier_away(sysfs: Path) -> None:
         '[{"ifname": "can0", "flags": null, "linkinfo": 3}]',
     ],
 )
-def test_without_a_usable_ip_what_sys_tells_has_to_do(sysfs: Path, answer: str | Exception) -> None:
+def test_without_a_usable_ip_the_files_of_sys_have_to_do(
+    sysfs: Path, answer: str | Exception
+) -> None:
     def run(_command: Sequence[str]) -> str:
         if isinstance(answer, Exception):
             raise answer
@@ -169,7 +171,7 @@ def test_an_interface_that_is_not_there_is_not_asked_for(sysfs: Path, name: str)
     assert read_interface(name, run=run, sysfs=sysfs) is Unseen.MISSING
 
 
-def test_a_system_without_sys_does_not_tell(tmp_path: Path) -> None:
+def test_a_system_without_sys_gives_no_answer(tmp_path: Path) -> None:
     assert look_up("can0", sysfs=tmp_path / "none") is Unseen.CANNOT_TELL
 
 

@@ -34,7 +34,7 @@ def is_free(config: dict[str, Any]) -> bool:
     return True
 
 
-def test_a_second_holder_is_told_who_has_it_and_since_when() -> None:
+def test_a_second_holder_learns_who_has_it_and_since_when() -> None:
     release = lock.acquire(CAN0, "flasher flash")
     with pytest.raises(BusError) as caught:
         lock.acquire(CAN0, "flasher read")
@@ -129,7 +129,7 @@ def test_who_was_killed_holds_nothing() -> None:
 
 
 @pytest.mark.parametrize("told", ["", "[]", "{", '{"holder": 1}', "\x00\xff"])
-def test_what_stands_beside_the_lock_may_be_anything(state: Path, told: str) -> None:
+def test_what_is_beside_the_lock_may_be_anything(state: Path, told: str) -> None:
     release = lock.acquire(CAN0, "one")
     (note,) = state.glob("flasher/locks/*.json")
     note.write_text(told)
@@ -138,7 +138,7 @@ def test_what_stands_beside_the_lock_may_be_anything(state: Path, told: str) -> 
     release()
 
 
-def test_a_state_folder_that_cannot_be_written_keeps_nobody_from_working(
+def test_a_state_folder_that_cannot_be_written_keeps_no_one_from_working(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "file").touch()

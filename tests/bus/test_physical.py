@@ -63,7 +63,7 @@ def kernel(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str, kind: str
         ("vcan2", None, True),  # there is no `ip`: nobody knows
     ],
 )
-def test_the_kernel_tells_what_a_network_interface_is(
+def test_the_kernel_reports_what_a_network_interface_is(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str, kind: str | None, physical: bool
 ) -> None:
     kernel(monkeypatch, tmp_path, name, kind)
@@ -89,7 +89,9 @@ def test_the_kernel_tells_what_a_network_interface_is(
         ("slcan", "\0", True),
     ],
 )
-def test_others_are_told_by_their_back_end(interface: str, channel: str, physical: bool) -> None:
+def test_others_are_reported_by_their_back_end(
+    interface: str, channel: str, physical: bool
+) -> None:
     assert is_physical(interface, channel) is physical
 
 
@@ -115,7 +117,7 @@ def test_a_file_that_is_called_so_is_no_pseudo_terminal(tmp_path: Path) -> None:
     assert is_physical("slcan", str(port))
 
 
-def test_links_tell_it() -> None:
+def test_links_distinguish_it() -> None:
     assert not SimulatedBus(250_000, VirtualClock()).link().is_physical
     with can.Bus("physical", interface="virtual", ignore_config=True) as bus:
         assert not CanLink(bus, "virtual", "physical").is_physical

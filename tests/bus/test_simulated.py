@@ -121,7 +121,7 @@ def test_the_lowest_id_wins_and_nothing_is_lost() -> None:
     assert [link.receive(1.0), link.receive(1.0)] == [low, high]
 
 
-def test_everybody_but_the_sender_hears_a_frame() -> None:
+def test_everybody_but_the_sender_receives_a_frame() -> None:
     bus = SimulatedBus(BITRATE, VirtualClock())
     one, two = Talker(Frame(0x725, b"x")), Talker()
     bus.attach(one)

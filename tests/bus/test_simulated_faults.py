@@ -102,7 +102,7 @@ def test_the_devices_go_on_while_it_is_out() -> None:
 # -- bus-off --------------------------------------------------------------------------------------
 
 
-def test_bus_off_is_reported_and_then_sending_says_so() -> None:
+def test_bus_off_is_reported_and_sending_fails_with_it() -> None:
     world = World()
     world.bus.bus_off()
     world.link.send(FRAME)  # taken and lost, until the report has been read

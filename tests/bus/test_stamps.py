@@ -86,7 +86,7 @@ def port_on(bus: FakeBus, interface: str, now: Callable[[], float]) -> RealPort:
 @pytest.mark.parametrize(
     ("interface", "source", "late_s"), [("socketcan", "kernel", _LATE_S), ("pcan", "host", 0.0)]
 )
-def test_the_suite_says_whose_time_stamps_it_has_and_uses_them(
+def test_the_suite_states_whose_time_stamps_it_has_and_uses_them(
     bus: FakeBus, interface: str, source: str, late_s: float
 ) -> None:
     opened_s = 1.0

@@ -98,7 +98,7 @@ def test_a_person_is_asked_before_anything_is_erased(
     assert run.document["device_state"] == "nothing was erased by this acceptance"
 
 
-def test_another_device_than_the_label_says_ends_it(
+def test_another_device_than_that_of_the_label_ends_it(
     walk: Callable[..., Run], answering: Callable[[Iterable[bool]], list[str]]
 ) -> None:
     answering([False])

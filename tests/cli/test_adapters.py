@@ -77,7 +77,7 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> Machine:
 # -- what is there ---------------------------------------------------------------------------------
 
 
-def test_each_adapter_stands_there_with_the_arguments_that_use_it(
+def test_each_adapter_is_listed_with_the_arguments_that_use_it(
     flasher: Flasher, machine: Machine
 ) -> None:
     machine.detected.found = [CAN0, PCAN, IXXAT]
@@ -95,7 +95,7 @@ def test_each_adapter_stands_there_with_the_arguments_that_use_it(
     assert listed[2]["arguments"][4:] == ["--bus-kwargs", "unique_hardware_id=HW 12"]
 
 
-def test_an_interface_that_is_down_says_how_it_is_started(
+def test_an_interface_that_is_down_states_how_it_is_started(
     flasher: Flasher, machine: Machine
 ) -> None:
     machine.detected.found = [CAN0]
@@ -103,7 +103,7 @@ def test_an_interface_that_is_down_says_how_it_is_started(
     assert "down, `ip link set can0 up type can bitrate 250000" in flasher("adapters").out
 
 
-def test_serial_ports_are_apart_since_nobody_knows_what_is_behind_them(
+def test_serial_ports_are_apart_since_what_is_at_them_is_unknown(
     flasher: Flasher, machine: Machine
 ) -> None:
     machine.ports = [DetectedAdapter("slcan", "/dev/ttyACM0", {"description": "CANable2 \x1b[2J"})]
@@ -115,7 +115,7 @@ def test_serial_ports_are_apart_since_nobody_knows_what_is_behind_them(
     assert document["serial_ports"][0]["channel"] == "/dev/ttyACM0"
 
 
-def test_what_cannot_be_seen_is_said_with_its_reason(
+def test_what_cannot_be_seen_is_reported_with_its_reason(
     flasher: Flasher, machine: Machine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
@@ -138,7 +138,7 @@ def test_what_cannot_be_seen_is_said_with_its_reason(
     assert "etas, ixxat" in flasher("adapters").out
 
 
-def test_an_adapter_whose_channel_nobody_tells_is_listed_and_never_chosen(
+def test_an_adapter_whose_channel_is_unknown_is_listed_and_never_chosen(
     flasher: Flasher, machine: Machine
 ) -> None:
     machine.detected.found = [DetectedAdapter("neovi", "", {"serial": "CY1234"})]
@@ -158,7 +158,7 @@ LOOKS = [
 
 
 @pytest.mark.parametrize("words", LOOKS, ids=lambda words: words[0])
-def test_the_only_adapter_is_used_to_look_and_said(
+def test_the_only_adapter_is_used_to_look_and_named(
     flasher: Flasher, machine: Machine, words: tuple[str, ...]
 ) -> None:
     machine.detected.found = [CAN0]
@@ -171,7 +171,7 @@ def test_the_only_adapter_is_used_to_look_and_said(
     assert machine.asked == 1
 
 
-def test_what_tells_the_adapter_from_others_is_opened_too(
+def test_what_distinguishes_the_adapter_from_others_is_opened_too(
     flasher: Flasher, machine: Machine
 ) -> None:
     machine.detected.found = [IXXAT]
@@ -249,7 +249,7 @@ def test_the_bit_rate_that_is_refused_is_that_of_the_adapter_found(
 
 
 @pytest.mark.parametrize("target", ["bms", "wmc"])
-def test_flash_changes_nothing_where_the_device_is_not_heard(
+def test_flash_changes_nothing_where_the_device_does_not_answer(
     flasher: Flasher, machine: Machine, target: str
 ) -> None:
     machine.detected.found = [CAN0]
@@ -273,7 +273,7 @@ def test_another_device_on_the_bus_is_not_the_one(flasher: Flasher, machine: Mac
     assert machine.wire.link.health().frames_sent == 0
 
 
-def test_flash_goes_on_where_it_is_heard_and_says_so(
+def test_flash_goes_on_where_the_device_answers_and_reports_it(
     flasher: Flasher, machine: Machine, short_bms: Path
 ) -> None:
     machine.detected.found = [CAN0]
@@ -296,7 +296,7 @@ def test_rescue_needs_no_word_before_the_announcement_that_it_waits_for(
     assert machine.wire.link.health().frames_sent == 0
 
 
-def test_write_writes_nothing_where_the_battery_is_not_heard(
+def test_write_writes_nothing_where_the_battery_does_not_answer(
     flasher: Flasher, machine: Machine
 ) -> None:
     machine.detected.found = [CAN0]

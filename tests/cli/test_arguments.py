@@ -175,7 +175,7 @@ def test_bus_kwargs_without_a_value_are_wrong_usage(flasher: Flasher) -> None:
     assert f"'{OBC_BIN}'" in run.err
 
 
-def test_a_second_value_behind_an_option_that_repeats_is_wrong_usage(flasher: Flasher) -> None:
+def test_a_second_value_after_an_option_that_repeats_is_wrong_usage(flasher: Flasher) -> None:
     run = flasher("flash", "--bus-kwargs", "a=1", "b=2", OBC_BIN, "-t", "obc", "-i", "virtual")
     assert run.code == ExitCode.USAGE
     assert "--bus-kwargs takes one value, and may be repeated" in run.err
@@ -184,7 +184,7 @@ def test_a_second_value_behind_an_option_that_repeats_is_wrong_usage(flasher: Fl
     assert "--case takes one value, and may be repeated" in run.err
 
 
-def test_behind_two_dashes_everything_is_positional(
+def test_after_two_dashes_everything_is_positional(
     flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

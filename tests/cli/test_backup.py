@@ -38,7 +38,7 @@ def unpacked(path: Path) -> tuple[dict[str, Any], bytes]:
         return json.loads(archive.read("backup.json")), memory
 
 
-def test_the_area_of_the_profile_is_saved_with_everything_that_the_battery_tells(
+def test_the_area_of_the_profile_is_saved_with_everything_that_the_battery_reports(
     flasher: Flasher, battery: Battery, tmp_path: Path
 ) -> None:
     (tmp_path / "flasher.toml").write_text(AREA)
@@ -84,7 +84,9 @@ def test_memory_that_does_not_name_the_running_version_is_saved_with_a_warning(
     assert "is not in this memory" in run.err
 
 
-def test_memory_that_names_it_says_so(flasher: Flasher, battery: Battery, tmp_path: Path) -> None:
+def test_memory_that_names_it_is_reported(
+    flasher: Flasher, battery: Battery, tmp_path: Path
+) -> None:
     (tmp_path / "flasher.toml").write_text(AREA)
     battery.memory = b"..V1r0r0_20220512.".ljust(1024, b"\xff")
     run = flasher("backup", "-t", "bms", "-o", "b.zip", *MOCK)
@@ -92,7 +94,7 @@ def test_memory_that_names_it_says_so(flasher: Flasher, battery: Battery, tmp_pa
     assert "warning" not in run.err
 
 
-def test_what_is_not_answered_is_not_in_it_and_said(
+def test_what_is_not_answered_is_not_in_it_and_is_reported(
     flasher: Flasher, battery: Battery, tmp_path: Path
 ) -> None:
     battery.silent = frozenset({0x3800, 0x3300})
@@ -132,7 +134,7 @@ def test_a_device_that_cannot_be_read_is_refused_with_the_reason(
     assert battery.received == []
 
 
-def test_a_file_that_is_there_is_not_written_over_unless_told(
+def test_a_file_that_is_there_is_not_written_over_unless_asked_to(
     flasher: Flasher, battery: Battery, tmp_path: Path
 ) -> None:
     (tmp_path / "flasher.toml").write_text(AREA)

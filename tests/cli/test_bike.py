@@ -327,7 +327,7 @@ def test_the_repair_after_a_deadline_does_not_repeat_the_deadline(
     assert "--timeout" not in command
 
 
-def test_a_silent_device_that_is_left_out_is_not_said_to_be_reset(
+def test_a_silent_device_that_is_left_out_is_not_reported_to_be_reset(
     bike: BikeOnTheBus, upgrade: Callable[..., Run]
 ) -> None:
     bike.device(OBC).power_cut(bike.clock.now())
@@ -474,7 +474,7 @@ def test_options_for_one_image_are_refused(
         ("[[target]]\ntarget='bms'\nimage='nix.bin'\n", "no file of this name"),
     ],
 )
-def test_a_set_that_cannot_be_used_says_why(
+def test_a_set_that_cannot_be_used_states_why(
     upgrade: Callable[..., Run], folder: Path, text: str, what: str
 ) -> None:
     (folder / "bike.toml").write_text(text)

@@ -208,7 +208,7 @@ def test_another_bit_rate_than_the_dialects_is_refused_before_anything_is_opened
     assert opened == []
 
 
-def test_the_option_says_another_bit_rate(
+def test_the_option_sets_another_bit_rate(
     flasher: Flasher, here: Path, opened: list[dict[str, Any]]
 ) -> None:
     (here / "flasher.toml").write_text(OTHER_RATE)
@@ -218,7 +218,7 @@ def test_the_option_says_another_bit_rate(
     assert opened[1]["bitrate"] == 250_000
 
 
-def test_the_source_that_is_told_is_the_one_that_held(flasher: Flasher) -> None:
+def test_the_source_that_is_reported_is_the_one_that_held(flasher: Flasher) -> None:
     assert flasher("profile", "show", "-t", "bms").code == ExitCode.OK  # no variables from here on
     fallback = Fallback({"interface": "pcan", "channel": "x", "bitrate": 250_000}, "[bus] of f")
     assert api.bit_rate(fallback=fallback) == BitRate(250_000, "[bus] of f")
@@ -238,7 +238,7 @@ def test_a_variable_that_agrees_is_the_source_before_the_table(
 
 
 @pytest.mark.slow
-def test_doctor_says_that_it_is_in_effect_and_what_it_names(
+def test_doctor_states_that_it_is_in_effect_and_what_it_names(
     flasher: Flasher, here: Path, opened: list[dict[str, Any]]
 ) -> None:
     (here / "flasher.toml").write_text(TABLE)
@@ -264,7 +264,7 @@ def test_doctor_says_that_it_is_in_effect_and_what_it_names(
         ("[bus]\ninterface = 'pcan'\n[bus.bus_kwargs]\nx = [1]", "bus.bus_kwargs.x cannot be"),
     ],
 )
-def test_what_is_wrong_is_told_by_every_command_that_reads_it(
+def test_what_is_wrong_is_reported_by_every_command_that_reads_it(
     flasher: Flasher, here: Path, opened: list[dict[str, Any]], table: str, words: str
 ) -> None:
     (here / "flasher.toml").write_text(table)
@@ -286,7 +286,7 @@ def test_what_else_is_wrong_in_the_file_is_no_matter_of_the_adapter(
 
 
 @pytest.mark.usefixtures("here")
-def test_none_at_all_says_where_one_may_stand(flasher: Flasher) -> None:
+def test_none_at_all_reports_where_one_may_be(flasher: Flasher) -> None:
     run = flasher("mock", "-t", "bms")
     assert run.code == ExitCode.BUS
     assert "nor [bus] of flasher.toml names one" in run.err

@@ -145,7 +145,7 @@ def test_fish_is_answered_by_the_word_under_the_cursor(
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_a_shell_is_told_how_to_ask(
+def test_a_shell_learns_how_to_ask(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch, shell: str
 ) -> None:
     monkeypatch.setenv("_FLASHER_COMPLETE", f"{shell}_source")
@@ -256,7 +256,7 @@ def test_help_lists_the_commands_by_purpose(flasher: Flasher) -> None:
         (None, [f"{int(code)} " for code in ExitCode], []),
     ],
 )
-def test_help_tells_the_exit_codes_and_what_is_read(
+def test_help_lists_the_exit_codes_and_what_is_read(
     flasher: Flasher, command: str | None, told: list[str], untold: list[str]
 ) -> None:
     said = flasher(*([command] if command else []), "--help").out
@@ -265,7 +265,7 @@ def test_help_tells_the_exit_codes_and_what_is_read(
     assert not any(text in said for text in untold)
 
 
-def test_an_action_tells_what_it_reads(flasher: Flasher) -> None:
+def test_an_action_reports_what_it_reads(flasher: Flasher) -> None:
     assert "  flasher.toml" in flasher("profile", "show", "--help").out
 
 

@@ -140,7 +140,7 @@ def test_a_second_tool_is_a_problem(flasher: Flasher, monkeypatch: pytest.Monkey
         ((0x123, 0x6603, b"abc"), "from no node of the system; ", "warning", None),
     ],
 )
-def test_what_is_said_on_the_bus(
+def test_what_is_sent_on_the_bus(
     flasher: Flasher,
     monkeypatch: pytest.MonkeyPatch,
     said: tuple[int, int, bytes],
@@ -257,7 +257,7 @@ def test_the_only_adapter_is_looked_at_where_none_is_named(examine: Doctor) -> N
     assert [config["channel"] for config in examine.opened] == ["PCAN_USBBUS1"]
 
 
-def test_of_several_none_is_opened_and_how_to_choose_is_said(examine: Doctor) -> None:
+def test_of_several_none_is_opened_and_how_to_choose_is_reported(examine: Doctor) -> None:
     examine.detected = DetectionResult(
         [DetectedAdapter("pcan", "PCAN_USBBUS1"), DetectedAdapter("kvaser", "0")]
     )
@@ -466,7 +466,7 @@ def test_the_adapter_is_opened_silent_where_it_can_be(examine: Doctor) -> None:
     assert examine(*ON_CAN0).document["traffic"]["listen_only"] is False
 
 
-def test_an_adapter_that_does_not_open_says_why(examine: Doctor) -> None:
+def test_an_adapter_that_does_not_open_states_why(examine: Doctor) -> None:
     examine.failure = PermissionError(13, "Permission denied")
     run = examine("-i", "slcan", "-c", "/dev/ttyACM0")
     assert run.code == ExitCode.BUS
@@ -492,7 +492,7 @@ def test_another_bit_rate_than_the_dialects_is_pointed_out(examine: Doctor) -> N
     assert run.document["bitrate_bps"] == 500_000
 
 
-def test_what_configures_python_can_besides_the_command_line_is_told(
+def test_what_configures_python_can_besides_the_command_line_is_reported(
     examine: Doctor, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     file = tmp_path / "can.conf"
@@ -562,6 +562,6 @@ def test_the_arguments_of_the_back_end_are_in_the_command_that_is_named(examine:
     )
 
 
-def test_it_says_where_it_listens(flasher: Flasher) -> None:
+def test_it_states_where_it_listens(flasher: Flasher) -> None:
     said = flasher("doctor", *MOCK, "--listen", "0.5").err
     assert said == "listening for 0.5 s on the built-in mock ...\n"

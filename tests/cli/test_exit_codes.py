@@ -292,7 +292,7 @@ NOT_YET = {12}
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_each_failure_has_its_exit_code_and_says_where_why_and_what_to_do(
+def test_each_failure_has_its_exit_code_and_states_where_why_and_what_to_do(
     flasher: Flasher, tmp_path: Path, case: Case
 ) -> None:
     stage = Stage()
@@ -323,7 +323,7 @@ def test_every_exit_code_that_exists_has_a_failure_here() -> None:
 @pytest.mark.parametrize(
     "case", [case for case in CASES if "packet 2" in case.where], ids=lambda case: case.name
 )
-def test_a_failure_in_the_transfer_says_what_the_device_is_left_with_and_leaves_a_bundle(
+def test_a_failure_in_the_transfer_states_what_the_device_is_left_with_and_leaves_a_bundle(
     flasher: Flasher, tmp_path: Path, case: Case
 ) -> None:
     stage = Stage()

@@ -40,7 +40,7 @@ def test_the_verdict_comes_first_then_the_story(flasher: Flasher, tmp_path: Path
         assert words in run.out
 
 
-def test_a_foreign_trace_says_that_there_is_no_upgrade(flasher: Flasher, tmp_path: Path) -> None:
+def test_a_foreign_trace_states_that_there_is_no_upgrade(flasher: Flasher, tmp_path: Path) -> None:
     tape = Tape()
     for number in range(30):
         tape.frame(Frame(0x180 + number % 3, bytes([number])))
@@ -78,7 +78,7 @@ def test_the_page_is_written_beside_the_text(flasher: Flasher, tmp_path: Path) -
     assert "a packet was refused again and again" in page.read_text(encoding="utf-8")
 
 
-def test_a_page_that_cannot_be_written_is_said_before_the_work(
+def test_a_page_that_cannot_be_written_is_reported_before_the_work(
     flasher: Flasher, tmp_path: Path
 ) -> None:
     run = flasher("explain", failed(tmp_path), "--html", tmp_path / "none" / "story.html")

@@ -45,7 +45,7 @@ def test_json_needs_a_file(flasher: Flasher, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("content", [b"", b"this is no trace\n"])
 @pytest.mark.parametrize("to", ["trace out.blf", "trace --joined out.blf", "csv out.csv"])
-def test_a_file_without_a_frame_is_said(
+def test_a_file_without_a_frame_is_reported(
     flasher: Flasher, tmp_path: Path, content: bytes, to: str
 ) -> None:
     (tmp_path / "empty.asc").write_bytes(content)
@@ -126,7 +126,7 @@ def test_a_trace_that_is_cut_off_is_written_up_to_there(flasher: Flasher, tmp_pa
         ("trace.blf", "a file of the command itself"),
     ],
 )
-def test_what_cannot_be_written_is_told(
+def test_what_cannot_be_written_is_reported(
     flasher: Flasher, trace: Path, tmp_path: Path, name: str, said: str
 ) -> None:
     before = trace.read_bytes()
@@ -161,7 +161,7 @@ def test_an_export_needs_to_be_named(flasher: Flasher) -> None:
     assert "Did you mean wireshark?" in ran.err
 
 
-def test_the_folder_of_a_bundle_stands_for_its_trace(
+def test_the_folder_of_a_bundle_is_read_as_its_trace(
     flasher: Flasher, trace: Path, tmp_path: Path
 ) -> None:
     bundle = tmp_path / "flasher-bms"

@@ -65,7 +65,7 @@ class _Time:
 
 
 @pytest.mark.slow
-def test_the_paced_mock_takes_the_time_that_the_plan_says(
+def test_the_paced_mock_takes_the_time_that_the_plan_states(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real = _Time()
@@ -108,14 +108,14 @@ def test_a_dry_run_prints_the_plan_and_opens_no_adapter(flasher: Flasher) -> Non
     assert "nothing was sent" in run.out
 
 
-def test_a_quiet_flash_says_only_the_result(flasher: Flasher) -> None:
+def test_a_quiet_flash_prints_only_the_result(flasher: Flasher) -> None:
     run = flasher("-q", "flash", OBC, "-t", "obc", "--mock", "--mock-speed", "0")
     assert run.err == ""
     assert "completed:" in run.out
 
 
 @pytest.mark.parametrize("words", [("-v",), ("-vv",)])
-def test_verbosity_is_taken_before_and_behind_the_command(
+def test_verbosity_is_taken_before_and_after_the_command(
     flasher: Flasher, words: tuple[str, ...]
 ) -> None:
     before = flasher(*words, "flash", OBC, "-t", "obc", "--mock", "--mock-speed", "0")
@@ -293,7 +293,7 @@ def test_a_silent_bus_is_exit_code_5_in_bounded_time(flasher: Flasher) -> None:
     assert "State of the device: this run erased nothing" in run.err
 
 
-def test_an_adapter_that_fails_in_the_middle_says_how_far_it_came_and_what_is_left(
+def test_an_adapter_that_fails_in_the_middle_states_how_far_it_came_and_what_is_left(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """BU-05."""
@@ -322,7 +322,7 @@ def test_filters_do_not_disturb_the_json_on_stdout(flasher: Flasher) -> None:
     assert run.document["ok"] is True
 
 
-def test_a_bug_is_exit_code_1_and_says_so(
+def test_a_bug_is_exit_code_1_and_is_called_a_bug(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*_args: object, **_options: object) -> None:

@@ -127,7 +127,7 @@ def test_a_bootloader_that_is_refused_starts_its_application_again(bench: Workbe
     assert bench.flash(stage, "--allow-boot-name").code == ExitCode.OK
 
 
-def test_a_right_manifest_lets_every_check_pass_and_says_so(bench: Workbench) -> None:
+def test_a_right_manifest_lets_every_check_pass_and_the_result_names_it(bench: Workbench) -> None:
     stage = Stage()
     keys = {
         "hardware_versions": ["V1r2r0_*"],
@@ -166,14 +166,14 @@ def test_a_rule_that_cannot_be_checked_refuses_as_one_that_fails(
     assert "warning: the BMS's application reported no version" in run.err
 
 
-def test_a_rescue_says_that_it_goes_on_unchecked(bench: Workbench) -> None:
+def test_a_rescue_states_that_it_goes_on_unchecked(bench: Workbench) -> None:
     stage = Stage(has_application=False)
     run = bench.flash(stage, manifest={"hardware_versions": ["V9*"]}, command="rescue")
     assert run.code == ExitCode.OK, run.err
     assert "the manifest's rule on hardware cannot be checked: goes on unchecked" in run.err
 
 
-def test_where_there_is_nothing_to_check_against_a_line_says_so(bench: Workbench) -> None:
+def test_where_there_is_nothing_to_check_against_a_line_states_it(bench: Workbench) -> None:
     run = bench.flash(Stage("obc"))
     assert run.code == ExitCode.OK
     unknown = [line for line in run.err.splitlines() if line.startswith("check: unknown: ")]
@@ -182,7 +182,7 @@ def test_where_there_is_nothing_to_check_against_a_line_says_so(bench: Workbench
     assert "neither hardware nor downgrade can be checked" in unknown[1]
 
 
-def test_the_manifests_version_stands_in_for_one_that_the_image_does_not_name(
+def test_the_manifests_version_replaces_one_that_the_image_does_not_name(
     bench: Workbench,
 ) -> None:
     nameless = Image.from_bytes(VECTORS + bytes(300))
@@ -313,7 +313,7 @@ def test_bytes_that_are_not_the_manifests_are_refused_whatever_is_allowed(
     assert stage.heard == []
 
 
-def test_a_dry_run_says_what_the_image_says_of_the_target_and_asks_nobody(
+def test_a_dry_run_states_what_the_image_declares_of_the_target_and_asks_no_device(
     bench: Workbench,
 ) -> None:
     stage = Stage()

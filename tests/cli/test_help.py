@@ -33,11 +33,11 @@ def exit_code_in(code: ErrorCode) -> int:
     return int(code[1:] if code is ErrorCode.INTERRUPTED else code[1:-2])
 
 
-def test_the_page_tells_each_code_in_order() -> None:
+def test_the_page_explains_each_code_in_order() -> None:
     assert list(told.error_codes()) == [code.value for code in ErrorCode]
 
 
-def test_each_code_is_told_to_its_end() -> None:
+def test_each_code_is_explained_to_its_end() -> None:
     page = (PACKAGE / "error_codes.md").read_text(encoding="utf-8")
     for code, one in told.error_codes().items():
         section = page.partition(f"## {code}: ")[2].partition("\n## ")[0]
@@ -72,7 +72,7 @@ def test_the_code_of_an_error_has_the_exit_code_of_its_class() -> None:
     assert used | {ErrorCode.FILE_FAULTS} == set(ErrorCode)
 
 
-def test_a_code_is_printed_and_told(flasher: Flasher) -> None:
+def test_a_code_is_printed_and_explained(flasher: Flasher) -> None:
     failed = flasher("flash", "nix.bin", "-t", "bms")
     assert failed.err.splitlines()[0].endswith("no file of this name. [E201]")
     said = flasher("help", "e201")
@@ -97,7 +97,7 @@ def test_a_file_with_faults_has_their_code(flasher: Flasher, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("code", [*CODES, *Refusal])
-def test_a_code_of_the_station_is_told(flasher: Flasher, code: str) -> None:
+def test_a_code_of_the_station_is_explained(flasher: Flasher, code: str) -> None:
     ran = flasher("help", code)
     assert ran.code == 0
     assert "`" + code in ran.out if code in list(Refusal) else ran.out.startswith(f"{code}: ")

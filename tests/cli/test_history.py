@@ -171,7 +171,7 @@ def test_a_lock_that_another_program_holds_is_waited_for_a_moment_only(
 # -- reading ---------------------------------------------------------------------------------------
 
 
-def test_nothing_flashed_is_said(flasher: Flasher) -> None:
+def test_nothing_flashed_is_reported(flasher: Flasher) -> None:
     assert flasher("history").out == "nothing flashed yet\n"
     FlashHistory().begin(BEGAN)
     assert flasher("history", "-t", "wmc").out == "nothing flashed that fits\n"
@@ -205,7 +205,7 @@ def test_damaged_lines_are_left_out_and_counted(flasher: Flasher, file: Path) ->
     assert "6 lines" in run.err
 
 
-def test_what_stands_in_it_is_shown_escaped(flasher: Flasher) -> None:
+def test_what_it_contains_is_shown_escaped(flasher: Flasher) -> None:
     FlashHistory().begin(Began(**{**vars(BEGAN), "image": "\x1b[2J.hex"}))
     out = flasher("history").out
     assert "\x1b" not in out

@@ -107,7 +107,7 @@ def test_the_manifest_of_standard_input_needs_a_name(
     assert flasher("manifest", "check", "-").code == ExitCode.IMAGE
 
 
-def test_a_binary_says_that_its_address_is_unknown(flasher: Flasher) -> None:
+def test_a_binary_states_that_its_address_is_unknown(flasher: Flasher) -> None:
     run = flasher("image-info", SAMPLES / "obc.bin")
     assert "address: unknown" in run.out
     with_base = flasher("image-info", SAMPLES / "obc.bin", "--base", "0x8002000")

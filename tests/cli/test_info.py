@@ -143,7 +143,7 @@ def test_the_wmc_cannot_be_asked_and_what_it_sends_is_shown(
 
 
 @pytest.mark.usefixtures("battery")
-def test_a_wmc_that_sends_nothing_is_exit_5_and_said_to_be_unaskable(flasher: Flasher) -> None:
+def test_a_wmc_that_sends_nothing_is_exit_5_and_reported_to_be_unaskable(flasher: Flasher) -> None:
     run = flasher("info", "-t", "wmc", *MOCK)
     assert run.code == ExitCode.NO_ANSWER
     assert "no question to ask it" in " ".join(run.err.split())

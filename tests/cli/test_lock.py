@@ -34,7 +34,7 @@ def somebody_else() -> Iterator[None]:
     ],
     ids=lambda words: str(words[0]),
 )
-def test_a_command_that_asks_is_refused_and_told_who_has_the_adapter(
+def test_a_command_that_asks_is_refused_and_learns_who_has_the_adapter(
     flasher: Flasher, words: tuple[str, ...]
 ) -> None:
     run = flasher(*words, *BUS)

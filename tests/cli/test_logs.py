@@ -35,7 +35,7 @@ def records(path: Path) -> list[tuple[str, str, str]]:
 # -- the log file ----------------------------------------------------------------------------------
 
 
-def test_the_file_has_what_was_run_what_was_said_and_how_it_ended(
+def test_the_file_has_what_was_run_what_was_reported_and_how_it_ended(
     flasher: Flasher, tmp_path: Path
 ) -> None:
     path = tmp_path / "flasher.log"
@@ -96,7 +96,7 @@ def test_a_file_of_the_command_is_never_taken_for_the_log(
 
 
 @pytest.mark.skipif(not FULL.exists(), reason="there is no /dev/full")
-def test_a_full_disk_changes_nothing_but_says_so_once(flasher: Flasher) -> None:
+def test_a_full_disk_changes_nothing_and_is_reported_once(flasher: Flasher) -> None:
     plain = flasher("image-info", OBC)
     run = flasher("image-info", OBC, "--log-file", FULL)
     assert (run.code, run.out) == (0, plain.out)
@@ -267,7 +267,7 @@ def test_events_are_logged_by_how_much_they_matter(
     assert "\n" not in describe(event)
 
 
-def test_nothing_is_written_out_for_a_level_nobody_wants(
+def test_nothing_is_written_out_for_a_level_that_is_off(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("flasher.log.describe", lambda _event: pytest.fail("needless work"))
@@ -291,7 +291,7 @@ def test_trouble_of_every_kind_is_at_least_a_warning() -> None:
         assert level_of(object.__new__(event)) == logging.WARNING
 
 
-def test_what_python_can_says_after_the_end_goes_nowhere(flasher: Flasher) -> None:
+def test_what_python_can_prints_after_the_end_goes_nowhere(flasher: Flasher) -> None:
     """Without any handler, Python itself would print it."""
     assert flasher("image-info", OBC).code == 0
     handlers = logging.getLogger("can").handlers

@@ -42,7 +42,7 @@ def test_help_is_on_stdout_with_examples(flasher: Flasher, command: str | None) 
     assert run.err == ""
 
 
-def test_the_commands_are_told_to_who_names_none(flasher: Flasher) -> None:
+def test_the_commands_are_listed_where_none_is_named(flasher: Flasher) -> None:
     run = flasher()
     assert run.code == ExitCode.USAGE
     assert all(name in run.out for name in COMMANDS)
@@ -61,7 +61,7 @@ def test_python_m_flasher_is_the_same_and_exits_with_the_code() -> None:
 
 
 @each("seconds, text", [(0.0, "0.00 s"), (119.994, "119.99 s"), (3725.0, "62 min 05 s")])
-def test_long_times_are_told_in_minutes(seconds: float, text: str) -> None:
+def test_long_times_are_reported_in_minutes(seconds: float, text: str) -> None:
     assert duration(seconds) == text
 
 
@@ -253,7 +253,7 @@ def test_wrong_usage_is_a_json_document_too(flasher: Flasher, words: tuple[str, 
         (("conformance", "--repeat", "0"), "Invalid value for --repeat", "Try `flasher conf"),
     ],
 )
-def test_wrong_usage_says_what_is_wrong_and_what_was_meant(
+def test_wrong_usage_states_what_is_wrong_and_what_was_meant(
     flasher: Flasher, words: tuple[str, ...], said: str, remedy: str
 ) -> None:
     run = flasher(*words)

@@ -39,7 +39,7 @@ def manifest(image: Path, flasher: Flasher) -> Path:
 # -- create ---------------------------------------------------------------------------------------
 
 
-def test_create_writes_everything_it_is_told(flasher: Flasher, image: Path, sha256: str) -> None:
+def test_create_writes_everything_it_is_given(flasher: Flasher, image: Path, sha256: str) -> None:
     run = flasher(
         "manifest", "create", image, "-t", "bms",
         "--hardware-version", "V1r2r0_*", "--hardware-version", "V1r3r0_20230101",
@@ -88,7 +88,7 @@ def test_create_never_writes_over_the_image(flasher: Flasher, image: Path) -> No
 
 
 @pytest.mark.parametrize("output", ["", "missing/manifest.toml"])
-def test_create_says_where_it_cannot_write(flasher: Flasher, image: Path, output: str) -> None:
+def test_create_states_where_it_cannot_write(flasher: Flasher, image: Path, output: str) -> None:
     run = flasher("manifest", "create", image, "-t", "bms", "-o", image.parent / output)
     assert run.code == ExitCode.USAGE
     assert "[E202]" in run.err
@@ -144,7 +144,7 @@ def test_create_refuses_another_version_than_the_one_inside(flasher: Flasher, im
 
 
 @pytest.mark.usefixtures("manifest")
-def test_check_says_line_by_line_what_was_checked(
+def test_check_states_line_by_line_what_was_checked(
     flasher: Flasher, image: Path, sha256: str
 ) -> None:
     run = flasher("manifest", "check", image, "-t", "bms")
@@ -162,7 +162,7 @@ def test_check_says_line_by_line_what_was_checked(
     }
 
 
-def test_check_says_what_there_was_nothing_to_check_against(
+def test_check_states_what_there_was_nothing_to_check_against(
     flasher: Flasher, tmp_path: Path
 ) -> None:
     silent = tmp_path / "silent.bin"
@@ -256,7 +256,7 @@ def test_json_of_check_holds_every_check_also_of_a_refusal(flasher: Flasher, ima
 # -- image-info -----------------------------------------------------------------------------------
 
 
-def test_image_info_says_that_there_is_no_manifest(flasher: Flasher, image: Path) -> None:
+def test_image_info_states_that_there_is_no_manifest(flasher: Flasher, image: Path) -> None:
     run = flasher("image-info", image)
     assert f"release: no manifest beside it ({image}.toml)" in run.out
     assert "names:   BMS" in run.out
@@ -267,7 +267,7 @@ def test_image_info_says_that_there_is_no_manifest(flasher: Flasher, image: Path
 
 
 @pytest.mark.usefixtures("manifest")
-def test_image_info_says_that_the_manifest_agrees(
+def test_image_info_states_that_the_manifest_agrees(
     flasher: Flasher, image: Path, sha256: str
 ) -> None:
     run = flasher("image-info", image)
@@ -277,7 +277,7 @@ def test_image_info_says_that_the_manifest_agrees(
     assert document["manifest"]["release"]["sha256"] == sha256
 
 
-def test_image_info_tells_what_is_wrong_and_goes_on(
+def test_image_info_reports_what_is_wrong_and_goes_on(
     flasher: Flasher, image: Path, manifest: Path
 ) -> None:
     run = flasher("image-info", image, "-t", "obc")
@@ -291,7 +291,7 @@ def test_image_info_tells_what_is_wrong_and_goes_on(
     assert run.document["manifest"]["release"] is None
 
 
-def test_an_image_without_marks_says_so(flasher: Flasher, tmp_path: Path) -> None:
+def test_an_image_without_marks_is_reported_as_such(flasher: Flasher, tmp_path: Path) -> None:
     path = tmp_path / "data.bin"
     path.write_bytes(bytes(range(1, 200)))
     assert "names:   no target found inside" in flasher("image-info", path).out

@@ -300,14 +300,14 @@ def test_json_is_one_document_a_line_and_the_last_has_the_exit_code(
     assert all(document["text"] for document in happened)
 
 
-def test_quiet_says_what_happens_but_not_that_it_listens(serve: Serve, host: Host) -> None:
+def test_quiet_prints_what_happens_but_not_that_it_listens(serve: Serve, host: Host) -> None:
     host.do(host.interrupt)
     run = serve(options=("-q",))
     assert run.err == ""
     assert run.out.startswith("state:")
 
 
-def test_damage_and_refusals_are_told(serve: Serve, host: Host) -> None:
+def test_damage_and_refusals_are_reported(serve: Serve, host: Host) -> None:
     """A reset whose checksum is wrong, then one whose text is."""
     damaged = bytes.fromhex("55AA16074205 5245534554 00000000 F0")
     wrong = encode(Message(0x752, 0x16, 0x4205, b"RESEX"))
@@ -407,7 +407,7 @@ def test_a_folder_that_vanishes_meanwhile_is_one_message(
     assert "Traceback" not in run.err
 
 
-def test_a_link_stays_a_link_and_the_file_behind_it_is_written(
+def test_a_link_stays_a_link_and_its_target_is_written(
     serve: Serve, host: Host, tmp_path: Path
 ) -> None:
     real, link = tmp_path / "real.bin", tmp_path / "link.bin"
@@ -482,7 +482,7 @@ def test_a_choice_changes_the_device(serve: Serve, host: Host) -> None:
         ("window_s", ("--set window_s: write KEY=VALUE",)),
     ],
 )
-def test_a_choice_that_makes_no_sense_is_wrong_usage_and_says_what_would(
+def test_a_choice_that_makes_no_sense_is_wrong_usage_and_the_message_names_one_that_does(
     serve: Serve, choice: str, words: tuple[str, ...]
 ) -> None:
     run = serve("--set", choice)
@@ -511,7 +511,7 @@ def test_no_adapter_is_exit_code_4(flasher: Flasher) -> None:
 # -- wrong devices --------------------------------------------------------------------------------
 
 
-def test_a_variant_is_served_and_said(serve: Serve, host: Host) -> None:
+def test_a_variant_is_served_and_named(serve: Serve, host: Host) -> None:
     """RS-01 once: the tool hears the announcements, but never the general feedback."""
     host.do(host.upgrade)
     run = serve("--upgrades", "1", "--variant", "no-feedback")
@@ -524,7 +524,7 @@ def test_a_variant_is_served_and_said(serve: Serve, host: Host) -> None:
     assert host.outcomes[0].ok
 
 
-def test_a_variant_does_what_it_is_said_to_do_wrong(serve: Serve, host: Host) -> None:
+def test_a_variant_is_as_wrong_as_its_description(serve: Serve, host: Host) -> None:
     """RS-04: a reset with another text is confirmed."""
     wrong = encode(Message(0x752, 0x16, 0x4205, b"RESEX"))
 

@@ -118,7 +118,7 @@ def test_json_lines_hold_typed_fields_and_end_with_the_exit_code(
     assert (end["ok"], end["exit_code"], end["messages"], end["troubles"]) == (True, 0, 6, 1)
 
 
-def test_raw_shows_every_frame_before_what_it_says(flasher: Flasher, trace: Path) -> None:
+def test_raw_shows_every_frame_before_its_message(flasher: Flasher, trace: Path) -> None:
     lines = flasher("monitor", trace, "--raw", "--message", "nak").out.splitlines()
     at = next(number for number, line in enumerate(lines) if "NAK" in line)
     assert lines[at - 2 : at] == [
@@ -163,7 +163,7 @@ def test_a_table_of_a_trace_is_printed_once(
         (("--mock", "--lines", "--table"), "do not go together"),
     ],
 )
-def test_wrong_usage_says_what_is_wrong(
+def test_wrong_usage_states_what_is_wrong(
     flasher: Flasher, words: tuple[str, ...], said: str
 ) -> None:
     run = flasher("monitor", *words)

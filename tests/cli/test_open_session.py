@@ -198,7 +198,7 @@ def test_a_mock_knows_of_no_upgrade_of_before(flasher: Flasher, image: str) -> N
     assert "has no end" not in run.err
 
 
-def test_an_adapter_that_nobody_named_need_not_hear_a_device_that_was_left_there(
+def test_an_adapter_that_was_chosen_by_default_need_not_reach_a_device_that_was_left_there(
     flasher: Flasher,
     put: Callable[[Stage], Stage],
     image: str,
@@ -304,7 +304,7 @@ def test_one_that_ended_badly_names_its_command_unless_the_image_was_refused(
     assert (f"  repair   {BEGAN.again}" in shown) is (exit_code is ExitCode.TRANSFER)
 
 
-def test_one_that_was_killed_before_it_erased_says_so(flasher: Flasher) -> None:
+def test_one_that_was_killed_before_it_erased_reports_it(flasher: Flasher) -> None:
     kept()
     assert "device   as far as is known it received no update" in flasher("history").out
 
@@ -320,7 +320,7 @@ def test_what_is_kept_to_type_again_is_what_was_typed(
     assert flash.began.folder == str(Path.cwd())
 
 
-def test_explain_last_tells_of_the_upgrade_that_has_no_end(flasher: Flasher) -> None:
+def test_explain_last_explains_the_upgrade_that_has_no_end(flasher: Flasher) -> None:
     kept(reached=Reached("transfer", 123))
     run = flasher("explain", "--last", "--json")
     error = run.document["error"]

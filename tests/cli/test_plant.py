@@ -238,7 +238,9 @@ def test_a_refused_chain_is_named_by_send_and_by_status(
     )
 
 
-def test_a_station_file_without_a_plant_says_what_to_add(flasher: Flasher, tmp_path: Path) -> None:
+def test_a_station_file_without_a_plant_states_what_to_add(
+    flasher: Flasher, tmp_path: Path
+) -> None:
     file = tmp_path / "station.toml"
     file.write_text(STATION.replace('plant = "{plant}"\n', "").format(), encoding="utf-8")
     run = flasher("plant", "send", "--sockets", file)

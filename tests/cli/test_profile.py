@@ -76,7 +76,7 @@ def test_json_holds_typed_values_and_sources(flasher: Flasher, nowhere: Path) ->
         assert document["values"]["version_query.offset"] == {"value": 48, "source": "document"}
 
 
-def test_a_right_file_is_said_to_be_right(flasher: Flasher, nowhere: Path) -> None:
+def test_a_right_file_is_reported_to_be_right(flasher: Flasher, nowhere: Path) -> None:
     path = nowhere / "bench.toml"
     path.write_text("[wmc]\nattempts = 8\n")
     run = flasher("profile", "check", path)

@@ -293,7 +293,7 @@ def test_away_from_a_terminal_there_is_one_line_a_phase_and_no_carriage_return(
         ),
     ],
 )
-def test_verbosity_decides_how_much_is_said(
+def test_verbosity_decides_how_much_is_reported(
     capsys: pytest.CaptureFixture[str], verbosity: int, shown: list[str]
 ) -> None:
     show(

@@ -214,7 +214,7 @@ def test_on_a_terminal_it_asks_and_writes_on_yes(
 
 
 @pytest.mark.usefixtures("terminal")
-def test_ctrl_c_at_the_question_says_that_nothing_was_written(
+def test_ctrl_c_at_the_question_states_that_nothing_was_written(
     flasher: Flasher, battery: Battery, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def press(*_: object) -> str:
@@ -269,7 +269,7 @@ def test_an_unknown_option_is_still_refused(flasher: Flasher, battery: Battery) 
     assert battery.received == []
 
 
-def test_a_file_that_cannot_be_written_is_said_before_the_memory_is_read(
+def test_a_file_that_cannot_be_written_is_reported_before_the_memory_is_read(
     flasher: Flasher, battery: Battery, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = ("read", "memory", "0x8008000", "0x8008080", "-t", "bms", *MOCK, "-o")

@@ -78,7 +78,7 @@ def run_into(
     assert raised.value is error
 
 
-def test_a_failure_on_the_bus_leaves_a_bundle_and_says_where(
+def test_a_failure_on_the_bus_leaves_a_bundle_and_states_where(
     bundle_folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run_into(NoAnswerError("Nobody.", where="packet 3", cause="no power", remedy="Switch on."))
@@ -127,7 +127,7 @@ def test_an_interrupted_query_does_not_take_the_place_of_the_last_failure(
     assert len(bundles(bundle_folder)) == 1
 
 
-def test_what_fails_before_a_frame_was_sent_or_heard_leaves_nothing(
+def test_what_fails_before_a_frame_was_sent_or_received_leaves_nothing(
     flasher: Flasher, bundle_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -68,7 +68,7 @@ def test_rescue_is_one_json_document_too(flasher: Flasher) -> None:
     ],
     ids=" ".join,
 )
-def test_the_command_that_is_named_repairs_as_it_stands(
+def test_the_command_that_is_named_repairs_as_printed(
     flasher: Flasher,
     stage: Stage,
     tmp_path: Path,
@@ -154,7 +154,7 @@ def test_the_repair_is_what_was_typed_without_what_does_not_fit(
         ),
     ],
 )
-def test_a_refused_image_is_not_named_again_nor_what_was_said_about_it(
+def test_a_refused_image_is_not_named_again_nor_what_was_reported_about_it(
     repair_of: Callable[..., str], typed: str, repair: str
 ) -> None:
     assert repair_of(typed, is_refused=True) == f"flasher {repair}"
@@ -195,7 +195,7 @@ STAGES = [
 
 @pytest.mark.parametrize(("phase", "state", "needs_repair"), STAGES)
 @pytest.mark.parametrize("times", [1, 2])
-def test_ctrl_c_in_every_phase_says_what_the_device_has_and_how_to_repair_it(
+def test_ctrl_c_in_every_phase_states_what_the_device_has_and_how_to_repair_it(
     flasher: Flasher,
     stage: Stage,
     tmp_path: Path,
@@ -259,7 +259,7 @@ def test_ctrl_c_while_power_is_awaited_leaves_the_device_as_it_was(
 
 
 @pytest.mark.usefixtures("stage")
-def test_ctrl_c_in_the_verification_says_that_the_image_is_there(
+def test_ctrl_c_in_the_verification_states_that_the_image_is_there(
     flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def show(_progress: object, event: object) -> None:
@@ -278,7 +278,7 @@ def test_ctrl_c_in_the_verification_says_that_the_image_is_there(
     assert "rescue" not in error["remedy"]
 
 
-def test_ctrl_c_while_the_adapter_is_awaited_is_heard_at_once(
+def test_ctrl_c_while_the_adapter_is_awaited_takes_effect_at_once(
     flasher: Flasher, stage: Stage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def show(_progress: object, event: object) -> None:

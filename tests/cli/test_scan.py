@@ -33,7 +33,7 @@ def test_a_bit_rate_is_called_an_assumption(
     assert "BMS" in lines
 
 
-def test_a_display_unit_tells_the_other_dialect_and_how_to_ask_for_it(
+def test_a_display_unit_reports_the_other_dialect_and_how_to_ask_for_it(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     on_the_bus(monkeypatch, Battery(silent=SILENT, repeats=((0x740, 0x1305, b"READY"),)))

@@ -68,7 +68,7 @@ def test_every_command_describes_its_documents() -> None:
         assert getattr(module, "DOCUMENTS", ()), f"{command}: DOCUMENTS is missing"
 
 
-def test_every_class_and_field_that_is_described_says_what_it_is(schema: dict[str, Any]) -> None:
+def test_every_class_and_field_that_is_described_states_what_it_is(schema: dict[str, Any]) -> None:
     for name, definition in schema["$defs"].items():
         for form in definition.get("anyOf", [definition]):
             assert form["description"], name
@@ -238,7 +238,7 @@ def test_a_trace_with_everything_in_it_is_as_described(
     assert {line["kind"] for line in lines} >= {"frame", "foreign", "damaged"}
 
 
-def test_a_refused_write_says_that_nothing_was_written(
+def test_a_refused_write_states_that_nothing_was_written(
     flasher: Flasher, schema: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("flasher.cli.terminal.can_ask", lambda: True)

@@ -119,7 +119,7 @@ def test_another_unit_after_the_upgrade_gets_no_settings(
     assert battery.kept["user string 1"] == EMPTY
 
 
-def test_without_the_option_nothing_is_saved_unless_the_profile_says_so(
+def test_without_the_option_nothing_is_saved_unless_the_profile_sets_it(
     battery: Settings, flash: Callable[..., Run], tmp_path: Path
 ) -> None:
     assert flash().code == ExitCode.OK

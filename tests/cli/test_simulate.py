@@ -173,7 +173,7 @@ def test_a_campaign_goes_on_where_its_ledger_ends(
     assert "3 runs found in the ledger" in captured.err
 
 
-def test_the_page_of_a_stopped_campaign_says_so(
+def test_the_page_of_a_stopped_campaign_shows_that_it_was_stopped(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     def run_batch(batch: Batch, *_: object) -> Result:
@@ -241,7 +241,7 @@ def test_an_option_before_an_action_is_refused(
     assert f"{option} before the action " in captured.out + captured.err
 
 
-def test_an_option_of_the_output_stands_before_an_action(
+def test_an_option_of_the_output_comes_before_an_action(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert main(["simulate", "--json", "sweep", "--list"]) == ExitCode.OK

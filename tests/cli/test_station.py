@@ -82,7 +82,7 @@ def test_the_sample_recipe_can_be_used(flasher: Flasher) -> None:
     assert document["targets"][0]["version"] == "V1r0r5_20230301"
 
 
-def test_everything_that_speaks_against_a_recipe_is_said(
+def test_everything_that_is_wrong_with_a_recipe_is_reported(
     flasher: Flasher, recipe: Path, schema: dict[str, Any]
 ) -> None:
     text = recipe.read_text("utf-8").replace("part =", "parts =").replace("revision", "revison")
@@ -358,7 +358,7 @@ def test_sockets_that_can_never_work_end_the_station(
         (("--sockets", "with_badges.toml"), "badges_of_nobody.toml"),
     ],
 )
-def test_wrong_usage_says_what_is_wrong(
+def test_wrong_usage_states_what_is_wrong(
     flasher: Flasher,
     recipe: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -413,7 +413,7 @@ def test_with_badges_nothing_begins_before_one_is_scanned(
 
 
 @pytest.mark.slow
-def test_without_badges_it_is_said_once(flasher: Flasher, recipe: Path) -> None:
+def test_without_badges_it_is_reported_once(flasher: Flasher, recipe: Path) -> None:
     words = ("--mock-sockets", "1", "--units", "1", "--mock-bad", "0", "--lines", *FAST)
     run = flasher("station", "run", "--recipe", recipe, *words)
     assert run.out.count("No badge table: operator names are not checked.") == 1
@@ -609,7 +609,7 @@ def test_a_changed_attachment_is_found(
         (("report", "--csv", "no/folder.csv"), "folder does not exist"),
     ],
 )
-def test_what_is_not_there_is_said(
+def test_what_is_not_there_is_reported(
     flasher: Flasher, plant: Path, words: tuple[str, ...], said: str
 ) -> None:
     database = () if "--database" in words else ("--database", str(plant))
@@ -628,7 +628,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 
 @each("model", [Recipe, StationConfig, BadgeTable])
-def test_every_key_says_what_it_is(model: type[TomlTable]) -> None:
+def test_every_key_states_what_it_is(model: type[TomlTable]) -> None:
     tables = [model]
     for table in tables:
         for name, field in table.model_fields.items():

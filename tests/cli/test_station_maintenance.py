@@ -43,7 +43,7 @@ def place(bench: Bench) -> tuple[str, ...]:
 
 
 @pytest.mark.slow
-def test_verify_says_what_the_records_were_held_against(
+def test_verify_states_what_the_records_were_compared_with(
     flasher: Flasher, bench: Bench, place: tuple[str, ...], schema: dict[str, Any]
 ) -> None:
     run = flasher("station", "verify", *place)

@@ -60,7 +60,7 @@ def test_records_are_served_until_ctrl_c(tmp_path: Path) -> None:
         (("--web", "here"), "must be PORT or HOST:PORT"),
     ],
 )
-def test_what_cannot_be_served_is_said(
+def test_what_cannot_be_served_is_reported(
     flasher: Flasher, tmp_path: Path, options: tuple[str, ...], said: str
 ) -> None:
     bench = Bench(tmp_path)

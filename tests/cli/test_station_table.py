@@ -84,7 +84,7 @@ def drawn(board: Board, *, width: int = 80, height: int = 24, typed: str = "") -
 # -- the table -------------------------------------------------------------------------------------
 
 
-def test_a_row_says_socket_state_serial_number_step_percent_and_time_left() -> None:
+def test_a_row_shows_socket_state_serial_number_step_percent_and_time_left() -> None:
     board = board_of(
         SocketChanged("2", SocketState.RUNNING, "W2605002"),
         StepStarted("2", "W2605002", StepName.FLASH, 2, "bms"),
@@ -194,7 +194,7 @@ def test_labels_without_a_socket_wait_until_their_run_begins() -> None:
     assert not board.waiting
 
 
-def test_what_to_do_with_a_label_stands_behind_it() -> None:
+def test_what_to_do_with_a_label_comes_after_it() -> None:
     board = board_of(OperatorPrompted("", "Scan the socket."), ScanAccepted("W2", "label"))
     assert board.last_reply == "W2: label. Scan the socket."
     board.apply(ScanAccepted("SOCKET 1", "socket", "1"))

@@ -56,7 +56,7 @@ def test_the_first_signal_asks_and_the_second_interrupts(number: signal.Signals)
             signal.raise_signal(number)
 
 
-def test_the_user_is_told_once_and_not_from_within_the_handler() -> None:
+def test_the_user_is_informed_once_and_not_from_within_the_handler() -> None:
     """A handler may interrupt a print; another print in it would fail."""
     told: list[str] = []
     with stop_on_signal(lambda: told.append("stopping")) as stopped:
@@ -101,7 +101,7 @@ def test_a_handler_that_python_did_not_set_is_replaced_by_the_default(
 
 
 @signals_reach_processes
-def test_a_hangup_is_told_apart_and_interrupts_nothing_however_often_it_comes() -> None:
+def test_a_hangup_is_distinguished_and_interrupts_nothing_however_often_it_comes() -> None:
     with stop_on_signal() as stop:
         for _ in range(3):
             signal.raise_signal(signal.SIGHUP)
@@ -228,7 +228,7 @@ def told(process: subprocess.Popen[str]) -> Callable[[str], list[str]]:
 
 @signals_reach_processes
 @pytest.mark.parametrize("number", SIGNALS)
-def test_a_signal_in_the_transfer_ends_it_cleanly_and_says_what_to_do(
+def test_a_signal_in_the_transfer_ends_it_cleanly_and_states_what_to_do(
     tmp_path: Path, number: signal.Signals
 ) -> None:
     with flashing(tmp_path) as process:

@@ -27,7 +27,7 @@ LONG = (
 
 
 @each("width", [40, 60, 80, 120, 300])
-def test_text_is_wrapped_between_words_and_hangs_behind_its_label(width: int) -> None:
+def test_text_is_wrapped_between_words_and_hangs_after_its_label(width: int) -> None:
     lines = wrap_line(LONG, width)
     assert " ".join(line.strip() for line in lines) == LONG.strip()
     assert all(len(line) <= width or " " not in line.strip() for line in lines)

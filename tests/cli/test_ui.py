@@ -105,7 +105,7 @@ def test_an_upgrade_that_went_through_ends_well(
 
 
 @pytest.mark.slow
-def test_ctrl_c_in_an_upgrade_says_what_is_left(
+def test_ctrl_c_in_an_upgrade_states_what_is_left(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     def do(browser: _Browser) -> None:

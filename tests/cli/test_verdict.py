@@ -57,7 +57,7 @@ def colours(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
     ids=["good", "not asked", "no query", "waived"],
 )
-def test_a_good_end_says_what_runs_and_is_green_only_where_nothing_is_unknown(
+def test_a_good_end_states_what_runs_and_is_green_only_where_nothing_is_unknown(
     flasher: Flasher, short_bms: Path, words: tuple[str | Path, ...], line: str
 ) -> None:
     run = flasher("flash", *(short_bms if word == BMS else word for word in words), *MOCK)
@@ -96,7 +96,7 @@ def test_a_bad_end_is_red_and_the_last_line_whatever_came_before(
     assert bool(run.out) == bool(form)
 
 
-def test_what_makes_the_last_line_long_stands_in_the_error_alone(
+def test_what_makes_the_last_line_long_is_in_the_error_alone(
     flasher: Flasher, tmp_path: Path
 ) -> None:
     (tmp_path / "noise.bin").write_bytes(random.Random(1).randbytes(3000))
@@ -112,7 +112,7 @@ def test_the_last_line_names_a_file_whole(flasher: Flasher, name: str) -> None:
 
 
 @pytest.mark.slow
-def test_figures_of_the_line_and_passed_checks_are_told_with_v_and_in_json(
+def test_figures_of_the_line_and_passed_checks_are_reported_with_v_and_in_json(
     flasher: Flasher, short_bms: Path
 ) -> None:
     loud = flasher("flash", OBC, "-t", "obc", "-v", *MOCK)

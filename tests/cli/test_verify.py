@@ -115,7 +115,7 @@ def test_the_version_alone_is_compared_on_request(verify: Comparison, flashed: S
     assert "memory:  not compared: as requested" in run.out
 
 
-def test_an_image_that_names_no_version_says_what_runs(verify: Comparison) -> None:
+def test_an_image_that_names_no_version_states_what_runs(verify: Comparison) -> None:
     nameless = replace(IMAGE, data=IMAGE.data.replace(NEW.encode(), b"no version here.."))
     run = verify(Stage(), "--level", "version", image=nameless)
     assert run.code == ExitCode.OK
@@ -130,7 +130,7 @@ def test_a_device_in_its_bootloader_runs_nothing(verify: Comparison) -> None:
     assert "version: not reported" in run.out
 
 
-def test_a_silent_device_is_not_said_to_run_another_image(verify: Comparison) -> None:
+def test_a_silent_device_is_not_reported_to_run_another_image(verify: Comparison) -> None:
     stage = Stage()
     stage.cut_power()
     run = verify(stage)

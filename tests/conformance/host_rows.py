@@ -55,7 +55,7 @@ HOST_ROWS: Final[dict[str, tuple[str, ...]]] = {
     "FR-05": (
         _REASSEMBLER + "test_after_a_lost_frame_the_next_message_is_found",
         _REASSEMBLER + "test_after_a_lost_frame_the_next_message_is_found_without_silence_too",
-        _REASSEMBLER + "test_a_message_behind_a_partial_one_is_found_at_the_timeout",
+        _REASSEMBLER + "test_a_message_after_a_partial_one_is_found_at_the_timeout",
     ),
     "FR-06": (
         _REASSEMBLER + "test_a_length_that_does_not_fit_the_command_is_refused_at_once",
@@ -201,7 +201,7 @@ HOST_ROWS: Final[dict[str, tuple[str, ...]]] = {
         _DRIVER + "test_a_failing_adapter_ends_the_loop_with_its_error",
         (
             "cli/test_flash.py::"
-            "test_an_adapter_that_fails_in_the_middle_says_how_far_it_came_and_what_is_left"
+            "test_an_adapter_that_fails_in_the_middle_states_how_far_it_came_and_what_is_left"
         ),
         _ODD + "test_an_adapter_that_is_pulled_out_ends_it_within_a_second",
     ),
@@ -229,11 +229,11 @@ HOST_ROWS: Final[dict[str, tuple[str, ...]]] = {
         "cli/test_read_write.py::test_escape_sequences_from_the_device_are_shown_escaped",
         "cli/test_info.py::test_a_broken_device_is_shown_harmlessly",
         "cli/test_explain.py::test_hostile_texts_do_not_reach_the_terminal",
-        "host/test_identity.py::test_what_a_device_tells_is_shown_escaped",
+        "host/test_identity.py::test_what_a_device_reports_is_shown_escaped",
         "report/test_explain_page.py::test_hostile_text_is_shown_and_does_nothing",
     ),
     "SE-03": (
-        _ANY + "test_the_host_ends_explicitly_whatever_the_device_says",
+        _ANY + "test_the_host_ends_explicitly_whatever_the_device_answers",
         "trace/test_decoder.py::test_nothing_on_the_bus_raises_and_everything_is_harmless",
     ),
     "CO-01": (
@@ -247,12 +247,12 @@ HOST_ROWS: Final[dict[str, tuple[str, ...]]] = {
     "CO-02": (
         _FAULTS + "test_two_devices_are_upgraded_on_one_bus_without_crosstalk",
         _FOREIGN
-        + "test_two_other_pairs_are_upgraded_at_the_same_time_and_nobody_notices_the_others",
+        + "test_two_other_pairs_are_upgraded_at_the_same_time_and_do_not_notice_each_other",
     ),
     "CO-03": (
         _STAGES
         + "test_a_second_tool_ends_the_session_in_every_stage_and_not_one_frame_more_is_sent",
         _STAGES + "test_a_query_of_a_second_tool_is_reported_once_and_the_upgrade_goes_on",
-        _GUARD + "test_a_frame_that_was_not_sent_is_somebody_else_and_is_told_in_hex",
+        _GUARD + "test_a_frame_that_was_not_sent_is_from_another_sender_and_is_reported_in_hex",
     ),
 }

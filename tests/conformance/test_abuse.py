@@ -109,7 +109,7 @@ def test_a_device_that_resets_at_random_fails_and_the_run_goes_on() -> None:
 
 @pytest.mark.slow
 @pytest.mark.no_cover
-def test_behind_a_node_that_takes_the_whole_bus_nothing_can_be_judged() -> None:
+def test_beside_a_node_that_takes_the_whole_bus_nothing_can_be_judged() -> None:
     report = run(MockSubject("bms", others=[Babbler(0.0)]), IMPATIENT, selection=SELECTION)
     assert_true_report(report)
     assert report.count(CaseVerdict.NOT_RUN) == len(CASES)

@@ -105,7 +105,7 @@ def test_power_can_be_cut_in_the_middle_of_a_flash_operation() -> None:
     assert not bench.subject.take_cut()
 
 
-def test_a_device_that_is_off_the_bus_hears_nothing_for_that_long() -> None:
+def test_a_device_that_is_off_the_bus_receives_nothing_for_that_long() -> None:
     bench = made()
     bench.subject.bus_off(0.5)
     assert bench.application_version(0.3) is None

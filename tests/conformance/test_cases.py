@@ -67,7 +67,7 @@ def test_a_choice_that_the_profile_does_not_state_fails() -> None:
     assert [result.verdict for result in report.results] == [CaseVerdict.FAIL, CaseVerdict.FAIL]
 
 
-def test_every_case_says_all_that_a_report_shows() -> None:
+def test_every_case_states_all_that_a_report_shows() -> None:
     for case_id, case in CASES.items():
         assert group_of(case_id) in GROUPS
         assert all((case.title, case.clause, case.stimulus, case.expectation)), case_id

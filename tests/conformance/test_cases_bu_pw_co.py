@@ -58,13 +58,13 @@ def test_the_mock_passes_by_its_profile_whatever_it_chooses(choices: dict[str, A
 
 
 @pytest.mark.slow
-def test_one_image_and_readback_tell_a_torn_image_too() -> None:
+def test_one_image_and_readback_report_a_torn_image_too() -> None:
     for name in ("starts-torn-image", "record-first"):
         assert verdicts(["PW-01"], name, with_second_image=False) == {"PW-01": CaseVerdict.FAIL}
     assert not_passed("PW-02", with_second_image=False) == []
 
 
-def test_versions_tell_a_torn_image_on_a_bench_without_readback() -> None:
+def test_versions_show_a_torn_image_on_a_bench_without_readback() -> None:
     result = result_of("PW-01", "record-first", has_readback=False)
     assert result.verdict is CaseVerdict.FAIL
     assert result.first_failure is not None
@@ -72,7 +72,7 @@ def test_versions_tell_a_torn_image_on_a_bench_without_readback() -> None:
 
 
 @pytest.mark.slow
-def test_a_bench_with_power_alone_judges_what_it_can_and_says_what_it_cannot() -> None:
+def test_a_bench_with_power_alone_judges_what_it_can_and_states_what_it_cannot() -> None:
     result = result_of("PW-01", has_readback=False, has_timed_cuts=False)
     assert result.verdict is CaseVerdict.PASS_IN_PART
     steps = [one.step for one in result.checks if one.outcome is CheckOutcome.UNSUPPORTED]
@@ -125,7 +125,7 @@ def test_power_is_cut_at_every_frame_of_an_upgrade_and_in_every_flash_operation(
     assert operations <= steps
 
 
-def test_the_cases_say_what_they_do() -> None:
+def test_the_cases_describe_what_they_do() -> None:
     for case_id in MINE:
         case = CASES[case_id]
         assert Requirement.DESTRUCTIVE in case.requires

@@ -69,7 +69,7 @@ def test_the_mock_passes_by_its_profile_whatever_it_chooses() -> None:
         ("EN-04", {"en_02": "silence"}),
     ],
 )
-def test_a_device_that_chooses_otherwise_than_its_profile_says_fails(
+def test_a_device_that_chooses_otherwise_than_its_profile_states_fails(
     case_id: str, states: dict[str, str]
 ) -> None:
     assert not_passed(case_id, states=states, image_checksum="crc32") == [case_id]

@@ -85,7 +85,7 @@ def test_the_mock_passes_by_its_profile_whatever_it_chooses(
 
 @pytest.mark.slow
 @pytest.mark.no_cover
-def test_a_device_that_says_nothing_to_damaged_packets_is_judged_all_the_same() -> None:
+def test_a_device_that_answers_nothing_to_damaged_packets_is_judged_all_the_same() -> None:
     assert failed(report(only=("CR-02",), bad_packet="silence", pause_in_transfer="waits")) == []
 
 
@@ -113,7 +113,7 @@ def test_what_a_product_documents_otherwise_is_right_and_has_to_be_true(
     assert failed(report(only=only, judged_by={key: value})) == [case_id]
 
 
-def test_a_device_that_looks_behind_a_wrong_tail_does_not_drop_what_is_there() -> None:
+def test_a_device_that_looks_past_a_wrong_tail_does_not_drop_what_is_there() -> None:
     assert failed(report(only=("FR-04",), judged_by={"fr_04": "dropped"})) == ["FR-04"]
     assert failed(report(only=("FR-04",), judged_by={"fr_04": "either"})) == []
 
@@ -130,7 +130,7 @@ def test_gaps_that_no_product_promises_are_observed_only() -> None:
     assert "gap of 50.0 ms: rejected" in infos
 
 
-def test_times_are_judged_all_together_and_tell_how_they_are_spread() -> None:
+def test_times_are_judged_all_together_and_report_how_they_are_spread() -> None:
     """TM-05: the report shows one slow answer among many, and the exceeded limit."""
     done = report("slow-sixteenth-packet", only=("TM-05",))
     (check,) = (one for one in done.results[0].checks if one.outcome is CheckOutcome.FAIL)

@@ -86,7 +86,7 @@ def test_the_mock_passes_by_its_profile_whatever_it_chooses(
         ("TX-13", {"tx_13": "restarts"}),
     ],
 )
-def test_a_device_that_chooses_otherwise_than_its_profile_says_fails(
+def test_a_device_that_chooses_otherwise_than_its_profile_states_fails(
     case_id: str, states: dict[str, str]
 ) -> None:
     assert not_passed(case_id, states=states) == [case_id]

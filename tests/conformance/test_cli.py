@@ -122,7 +122,7 @@ def test_a_repeated_run_has_every_case_several_times(flasher: Flasher) -> None:
     assert results[2]["replay"].endswith("--case RS-04 --seed 1 --repeat 3")
 
 
-def test_verbose_tells_every_case_on_both_streams(flasher: Flasher) -> None:
+def test_verbose_reports_every_case_on_both_streams(flasher: Flasher) -> None:
     run = flasher(*MOCK, "--case", "RS-04", "-v")
     assert f"pass          RS-04  {CASES['RS-04'].title}" in run.out
     assert "RS-04 pass (0 left)" in run.err
@@ -193,7 +193,7 @@ def test_a_comparison_is_not_written_over_a_report(flasher: Flasher, tmp_path: P
     assert report.read_bytes() == before
 
 
-def test_a_walk_tells_before_it_begins_that_its_trace_cannot_be_written(
+def test_a_walk_reports_before_it_begins_that_its_trace_cannot_be_written(
     flasher: Flasher, tmp_path: Path
 ) -> None:
     walk = ("conformance", "explore", "-t", "bms", "--mock", "--steps", "3")
@@ -292,7 +292,7 @@ def test_cases_that_failed_are_selected_by_the_report_alone(
         ),
     ],
 )
-def test_wrong_usage_is_told_before_anything_is_done(
+def test_wrong_usage_is_reported_before_anything_is_done(
     flasher: Flasher, words: tuple[str, ...], code: int, said: str
 ) -> None:
     run = flasher("conformance", *words)
@@ -397,7 +397,7 @@ def test_an_adapter_that_fails_gives_its_exit_code_and_the_report(
     assert "not run" in run.out
 
 
-def test_the_exit_code_says_how_a_run_ended() -> None:
+def test_the_exit_code_states_how_a_run_ended() -> None:
     assert exit_code(run_case(passes_once), was_stopped=False) is ExitCode.OK
     assert exit_code(run_case(fails_once), was_stopped=False) is ExitCode.PARTIAL
     # Stopped after the last case, so nothing is missing.

@@ -39,7 +39,7 @@ def test_error_frames_alone_are_counted() -> None:
     assert _diagnosis(error, error).startswith("2 error frames and no frame ")
 
 
-def test_only_others_are_heard() -> None:
+def test_only_others_are_received() -> None:
     text = _diagnosis(RawFrame(0x123, b"\x00"), RawFrame(0x123, b"\x01"), RawFrame(0x1F0, b"\x00"))
     assert "725" in text
     assert text.endswith("123 (2 times), 1F0")

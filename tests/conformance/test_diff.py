@@ -160,7 +160,7 @@ def test_a_time_is_slower_beyond_threshold_and_uncertainty(
     assert strict.code == (12 if kind == "slower" else 0)
 
 
-def test_other_conditions_are_told(flasher: Flasher, old: Path) -> None:
+def test_other_conditions_are_reported(flasher: Flasher, old: Path) -> None:
     def change(document: dict[str, Any]) -> None:
         document["seed"] = "2"
         document["profile"]["limits.ack_s"] = 0.7

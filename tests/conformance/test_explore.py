@@ -99,7 +99,7 @@ def test_a_device_that_takes_no_upgrade_is_a_finding_before_the_first_step() -> 
     assert explored.steps == 0
 
 
-def test_pairs_of_phase_and_step_that_were_never_met_are_told() -> None:
+def test_pairs_of_phase_and_step_that_were_never_met_are_reported() -> None:
     explored = _explorer().explore(5)
     met = {(each.phase, each.step) for each in explored.coverage if each.count}
     assert met
@@ -155,7 +155,7 @@ def test_a_replay_that_finds_something_leaves_the_good_image() -> None:
 @pytest.mark.parametrize(
     "step", ["pocket", "update=abc", "packets", "packets=-1", "packets=0.5", "cut=good", "wait="]
 )
-def test_a_step_that_does_not_exist_is_said(step: str) -> None:
+def test_a_step_that_does_not_exist_is_reported(step: str) -> None:
     with pytest.raises(UsageError, match=f"no step '{step}'"):
         _explorer().replay(["reset", step])
 
@@ -208,7 +208,7 @@ def test_nothing_found_is_exit_code_0(flasher: Flasher) -> None:
     assert "never in the phase transfer" in ran.out
 
 
-def test_it_walks_for_a_time_and_tells_what_was_covered(flasher: Flasher) -> None:
+def test_it_walks_for_a_time_and_reports_what_was_covered(flasher: Flasher) -> None:
     ran = flasher("conformance", "explore", "-t", "bms", "--mock", "--for", "0.01")
     assert ran.code == 0
     assert " 1 walk, " in ran.out

@@ -43,7 +43,7 @@ def test_the_images_span_three_sectors_with_a_blank_one_over_zeros(sector_bytes:
     assert any(one == other for one, other in pairwise(packets))
 
 
-def test_other_images_have_one_packet_or_end_at_a_sector_before_it_and_behind_it() -> None:
+def test_other_images_have_one_packet_or_end_at_a_sector_before_it_and_after_it() -> None:
     good, second, sizes = made(2048)
     assert [len(image) for image in sizes] == [128, 2048, 2049, 2047]
     images = [good, second or b"", *sizes]

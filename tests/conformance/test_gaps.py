@@ -95,7 +95,7 @@ def check_full_bench(cases: Sequence[str]) -> None:
 
 @pytest.mark.slow
 @each("target, address", BENCHES)
-def test_what_a_bare_bench_cannot_judge_is_said_beforehand(target: str, address: int) -> None:
+def test_what_a_bare_bench_cannot_judge_is_reported_beforehand(target: str, address: int) -> None:
     check_bare_bench(target, address, SHORT)
 
 

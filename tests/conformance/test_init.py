@@ -200,7 +200,7 @@ def values(asked: InitResult) -> dict[str, Any]:
     return {one.key: one.value for one in asked.answers}
 
 
-def test_every_key_is_asked_or_it_is_said_why_not() -> None:
+def test_every_key_is_asked_or_the_reason_is_reported() -> None:
     asked = [key for _, keys in QUESTIONS for key in keys]
     assert sorted([*asked, *LIMITS, *NOT_ASKED]) == sorted(profile_keys())
 
@@ -368,7 +368,7 @@ def test_a_device_may_take_longer_for_an_answer_than_a_pause_lasts(
         assert answers(unit, wanted, device.profiles["fitting"].given) == wanted
 
 
-def test_a_limit_has_its_margin_and_says_it() -> None:
+def test_a_limit_has_its_margin_and_states_it() -> None:
     found = limit_answer("limits.ack_s", [0.1, 0.21], 0.1, 0.002)
     assert found.value == 0.64
     assert found.seen.startswith("measured 2 times, at most 210.0 ms; ")
@@ -431,7 +431,7 @@ def test_only_good_images_are_completed_as_often_as_the_user_is_told() -> None:
     assert pytest.approx(UPGRADES, rel=0.25) == subject.device.erased
 
 
-def test_a_device_that_is_not_there_is_told_and_nothing_is_asked() -> None:
+def test_a_device_that_is_not_there_is_reported_and_nothing_is_asked() -> None:
     subject = mock(DeafDevice)
     assert isinstance(subject.device, DeafDevice)
     subject.device.hangs = subject.device.hangs_for_good = True

@@ -178,7 +178,7 @@ def test_other_ways_that_the_document_leaves_open_pass(
         (PageDevice, ("FR-03", "PW-01"), {}),
     ],
 )
-def test_a_profile_that_tells_otherwise_fails_them(
+def test_a_profile_with_another_choice_fails_them(
     kind: type[ScriptedDevice], cases: Sequence[str], choices: dict[str, Value]
 ) -> None:
     assert set(judged(kind, cases, **choices)) == set(cases)

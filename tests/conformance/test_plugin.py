@@ -121,7 +121,7 @@ def test_what_a_run_keeps_is_what_the_command_line_keeps(
 
 
 @pytest.mark.slow
-def test_a_pass_in_part_says_what_was_not_tried_and_fails_a_strict_run(
+def test_a_pass_in_part_states_what_was_not_tried_and_fails_a_strict_run(
     pytester: pytest.Pytester,
 ) -> None:
     words = ("--btl-suite", "-k", "EN-07", "--btl-good-image", "good.bin", "-rP")
@@ -180,7 +180,7 @@ def test_power_and_readback_can_be_functions_of_a_conftest(pytester: pytest.Pyte
 
 
 @pytest.mark.slow
-def test_what_is_wrong_with_the_bench_is_told_without_a_traceback(
+def test_what_is_wrong_with_the_bench_is_reported_without_a_traceback(
     pytester: pytest.Pytester,
 ) -> None:
     pytester.makepyfile("def test_it(btl_bench): pass")

@@ -96,7 +96,7 @@ def test_an_adapter_that_echoes_nothing_hides_no_frame_that_the_bench_has_sent_t
     assert arrival.frame == request
 
 
-def test_one_echo_that_is_lost_does_not_hide_those_behind_it() -> None:
+def test_one_echo_that_is_lost_does_not_hide_those_after_it() -> None:
     clock = VirtualClock()
     bus = SimulatedBus(WELLING.bitrate_bps, clock, collides=False)
     port = RealPort(bus.link(), clock, WELLING.bitrate_bps, echoes=True)
@@ -159,7 +159,7 @@ def test_what_a_link_cannot_send_is_unsupported() -> None:
 
 
 @pytest.mark.parametrize(("on", "said"), [(True, "on"), (False, "off")])
-def test_the_power_command_says_on_or_off(tmp_path: Path, on: bool, said: str) -> None:
+def test_the_power_command_gets_on_or_off(tmp_path: Path, on: bool, said: str) -> None:
     path = tmp_path / "said"
     DevicePowerCommand(f'{sys.executable} -c "{SCRIPT}" {path} {{on|off}}')(on)
     assert path.read_text() == said

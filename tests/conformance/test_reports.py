@@ -95,12 +95,12 @@ def page_of(report: RunReport, **replays: str) -> str:
 
 @pytest.mark.slow
 @each("make", [wrong_run, hostile_report, lambda: run_case(passes_once)])
-def test_the_document_is_as_its_schema_says(make: Any) -> None:
+def test_the_document_is_as_its_schema_states(make: Any) -> None:
     document = {"report": document_of(make())}
     assert not mismatches(document, schema_of(ConformanceDocument))
 
 
-def test_the_document_tells_what_went_wrong_and_how_to_see_it_again() -> None:
+def test_the_document_reports_what_went_wrong_and_how_to_see_it_again() -> None:
     written = completed(
         wrong_run(),
         started_at=AT,
@@ -121,7 +121,9 @@ def test_the_document_tells_what_went_wrong_and_how_to_see_it_again() -> None:
 
 @pytest.mark.slow
 @each("address, by", [(AREA_START, ["version", "memory over the bus"]), (0, ["version"])])
-def test_all_forms_tell_alike_by_what_the_flash_was_compared(address: int, by: list[str]) -> None:
+def test_all_forms_state_alike_with_what_the_flash_was_compared(
+    address: int, by: list[str]
+) -> None:
     small = replace(MOCK_PROFILE, application_area_bytes=4096)
     device = MockSubject(profile=small)
     device.has_readback = False
@@ -145,7 +147,7 @@ def test_all_forms_tell_alike_by_what_the_flash_was_compared(address: int, by: l
         assert (lacking in text) == (address == 0)
 
 
-def test_many_failed_checks_are_counted_and_the_first_ones_told() -> None:
+def test_many_failed_checks_are_counted_and_the_first_ones_reported() -> None:
     (result,) = document_of(hostile_report())["results"]
     assert result["checks"]["failed"] == 99
     assert len(result["findings"]) == CHECKS_KEPT
@@ -162,7 +164,7 @@ def test_a_long_reason_is_shown_whole_on_request(verbose: bool) -> None:
     assert ("the last one" in text, "the very last one" in text) == (verbose, verbose)
 
 
-def test_times_are_told_with_their_histogram() -> None:
+def test_times_are_reported_with_their_histogram() -> None:
     values = [index / 1000 for index in range(1, 102)]
     measured = tuple(MeasuredTime("t", value, 0.002) for value in values)
     (times,) = document_of(with_status(CaseVerdict.PASS, measurements=measured))["times"]
@@ -243,7 +245,7 @@ def test_every_verdict_has_its_element() -> None:
     assert verdict_of(with_status(CaseVerdict.INFO, infos=("seen",)))[0] == "system-out"
 
 
-def test_a_deviation_is_told_and_one_that_is_none_any_more_fails_a_strict_run() -> None:
+def test_a_deviation_is_reported_and_one_that_is_none_any_more_fails_a_strict_run() -> None:
     profile = ConformanceProfile(PROFILE.given, deviations={"FR-00": "by design"})
     assert verdict_of(run_case(fails_once, profile=profile)) == (
         "system-out",
@@ -264,7 +266,7 @@ def test_a_run_that_broke_off_is_no_green_one() -> None:
     assert "no boot version" in [error.get("message") for error in lost.iter("error")]
 
 
-def test_a_failure_tells_stimulus_seed_and_replay() -> None:
+def test_a_failure_reports_stimulus_seed_and_replay() -> None:
     run = completed(wrong_run(), started_at=AT, replays={("RS-01", 1): "flasher x"})
     root = ET.fromstring(junit_report(run))  # noqa: S314  our own
     assert_valid(root)
@@ -298,7 +300,7 @@ def test_a_page_of_a_good_run_is_green_and_has_every_case() -> None:
         assert text in page.text
 
 
-def test_a_page_tells_stimulus_expected_got_and_the_decoded_trace() -> None:
+def test_a_page_shows_stimulus_expected_got_and_the_decoded_trace() -> None:
     page = Page(page_of(wrong_run(), RS_01="flasher conformance --case RS-01"))
     assert_self_contained(page)
     for text in (
@@ -335,7 +337,7 @@ def test_hostile_text_is_shown_and_does_nothing() -> None:
 
 
 @pytest.mark.slow
-def test_a_page_stays_small_however_much_a_case_says() -> None:
+def test_a_page_stays_small_however_much_a_case_reports() -> None:
     def talks(bench: Bench) -> None:
         for _ in range(300):
             bench.send(bench.encoder.query_version())

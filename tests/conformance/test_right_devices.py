@@ -255,7 +255,7 @@ def test_a_flaw_is_found_in_a_device_that_listens_only_after_its_announcements(
     assert blamed(case_id, kind=kind, given={**_AFTER_BURST, "up_02": "silence"})
 
 
-def test_a_case_without_a_stimulus_that_was_heard_does_not_pass() -> None:
+def test_a_case_without_a_stimulus_that_was_received_does_not_pass() -> None:
     # In the middle of what the profile takes for its window, its application starts.
     stated: dict[str, Value] = {"limits.window_s": 0.9, "up_02": "silence"}
     (found,) = blamed("UP-02", kind=StartsSlowly, given=stated)
@@ -265,7 +265,7 @@ def test_a_case_without_a_stimulus_that_was_heard_does_not_pass() -> None:
 
 @pytest.mark.slow
 @each("case_id", ("UP-02", "UP-06", "FR-04", "TX-04", "RS-04", "UP-03"))
-def test_a_case_states_how_many_of_its_stimuli_were_heard(case_id: str) -> None:
+def test_a_case_states_how_many_of_its_stimuli_were_received(case_id: str) -> None:
     report = run(subject(), profile_of_mock(), selection=Selection(cases=(case_id,)))
     (result,) = report.results
     (text,) = [info for info in result.infos if "stimuli were received" in info]

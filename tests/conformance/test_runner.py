@@ -109,7 +109,7 @@ def test_a_case_that_raises_is_an_error_and_the_run_goes_on() -> None:
     assert one(report, "RS-04").verdict is CaseVerdict.PASS
 
 
-def test_a_part_that_the_bench_cannot_do_is_said_and_the_rest_judged() -> None:
+def test_a_part_that_the_bench_cannot_do_is_reported_and_the_rest_judged() -> None:
     def partly(bench: Bench) -> None:
         bench.unsupported("a thing", "no tool")
         passes(bench)
@@ -135,7 +135,7 @@ def test_a_part_that_the_bench_cannot_do_is_said_and_the_rest_judged() -> None:
 
 
 @pytest.mark.slow
-def test_the_good_image_is_verified_by_what_there_is_and_the_report_says_how() -> None:
+def test_the_good_image_is_verified_by_what_there_is_and_the_report_states_how() -> None:
     def seen(target: str, *, readback: bool = False, address: int = 0) -> str:
         device = MockSubject(target)
         device.has_readback = readback
@@ -467,7 +467,7 @@ def test_a_case_is_repeated_with_a_seed_of_its_own() -> None:
     assert len({result.seed for result in report.results}) == 3
 
 
-def test_a_listener_is_told_in_order() -> None:
+def test_a_listener_gets_events_in_order() -> None:
     log = Log()
     run_case(passes, log=log)
     assert log.lines == [

@@ -202,7 +202,7 @@ def test_a_crash_is_printed_whole_and_once(flasher: Flasher, tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_the_report_of_a_sanitizer_is_told_without_its_dump() -> None:
+def test_the_report_of_a_sanitizer_is_printed_without_its_dump() -> None:
     report = _run(_FLAWS + "IsSanitized", "EN-01")
     found = _failures(report) + report.not_upgradable + report.stopped
     assert "stack-buffer-overflow | SUMMARY: message.c:70)" in found
@@ -236,7 +236,7 @@ def test_the_controller_takes_three_frames_and_asks_for_more_when_it_has_room() 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("flaw", ["EndsAtOnce", "SaysNothing"])
-def test_nobody_is_sent_to_look_for_wires_of_a_bootloader_on_the_computer(flaw: str) -> None:
+def test_no_message_names_wires_for_a_bootloader_on_the_computer(flaw: str) -> None:
     report = _run(_FLAWS + flaw, "BR-01")
     assert "could not be restored" in report.stopped
     assert "wiring" not in report.stopped + _failures(report)
@@ -252,7 +252,7 @@ def _children() -> set[str]:
     return set(Path(f"/proc/self/task/{os.getpid()}/children").read_text().split())
 
 
-def test_no_process_is_left_behind() -> None:
+def test_no_process_is_left() -> None:
     before = _children()
     with open_subject(_HERE, "bms", None, good_image=None, second_image=None) as (device, _):
         device.power(on=True)
@@ -277,7 +277,7 @@ def test_no_process_is_left_behind() -> None:
         (shutil.which("true") or "", "ended with status 0 in flasher_dut_about"),
     ],
 )
-def test_what_is_no_bootloader_is_said_at_once(subject: str, said: str) -> None:
+def test_what_is_no_bootloader_is_reported_at_once(subject: str, said: str) -> None:
     with pytest.raises(UsageError) as raised:
         _run(subject, "RS-01")
     assert said in f"{raised.value} {raised.value.cause}"
@@ -325,7 +325,7 @@ def test_sizes_of_nothing_are_refused(numbers: tuple[int, int, int]) -> None:
         Facts(*numbers, application_offset=0, application_bytes=1024)
 
 
-def test_what_is_written_to_the_pipe_and_is_no_message_is_said(tmp_path: Path) -> None:
+def test_what_is_written_to_the_pipe_and_is_no_message_is_reported(tmp_path: Path) -> None:
     program = tmp_path / "boot"
     program.write_text("#!/bin/sh\necho hello, I am a bootloader\nread line\n")
     program.chmod(0o755)
@@ -342,7 +342,7 @@ def test_what_is_written_to_the_pipe_and_is_no_message_is_said(tmp_path: Path) -
         (_NULL, "flasher_dut_about returns NULL"),
     ],
 )
-def test_a_library_in_the_working_directory_says_what_it_lacks(
+def test_a_library_in_the_working_directory_states_what_it_lacks(
     code: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

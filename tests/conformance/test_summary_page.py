@@ -24,7 +24,7 @@ def title_of(drawing: str) -> str:
     return title
 
 
-def test_the_badge_says_how_a_run_ended_and_how_much_was_judged() -> None:
+def test_the_badge_states_how_a_run_ended_and_how_much_was_judged() -> None:
     report = run_case(passes_once)
     assert title_of(badge(report)) == "bootloader conformance: 1 passed"
     (result,) = report.results

@@ -58,7 +58,7 @@ def test_a_variant_that_takes_no_upgrade_fails_the_bring_up() -> None:
     assert failing >= takes_none
 
 
-def test_a_variant_fails_nothing_but_its_clause_and_what_it_says_that_it_touches() -> None:
+def test_a_variant_fails_nothing_but_its_clause_and_what_it_declares_to_touch() -> None:
     for name, fails in LISTED.items():
         variant = VARIANTS[name]
         if variant.upgrade_works and not variant.everywhere:
@@ -68,6 +68,6 @@ def test_a_variant_fails_nothing_but_its_clause_and_what_it_says_that_it_touches
 
 @pytest.mark.slow
 @each("name", SAMPLE)
-def test_the_suite_says_what_the_table_says_of_the_case_of_the_clause(name: str) -> None:
+def test_the_suite_agrees_with_the_table_on_the_case_of_the_clause(name: str) -> None:
     clause = VARIANTS[name].clause
     assert row_of(name, [clause]).fails == (clause,)

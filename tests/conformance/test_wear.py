@@ -74,7 +74,7 @@ def test_upgrades_that_fail_are_named_by_their_number() -> None:
 
 
 @pytest.mark.slow
-def test_what_passes_is_told_in_one_check() -> None:
+def test_what_passes_is_reported_in_one_check() -> None:
     result = one(worn("SO-01", 30), "SO-01")
     assert [str(check) for check in result.checks] == [
         "expected 30 upgrades, each one verified; got 30 of 30"

@@ -59,7 +59,7 @@ def test_the_crc_is_that_of_the_documents_example() -> None:
         ),
     ],
 )
-def test_what_the_tool_says_is_byte_exact(target: str, reset: str, update: str, end: str) -> None:
+def test_what_the_tool_sends_is_byte_exact(target: str, reset: str, update: str, end: str) -> None:
     words = Encoder(target)
     assert said(words.reset()) == reset
     assert said(words.update(78351)) == update
@@ -88,7 +88,7 @@ def test_a_packet_is_18_whole_frames() -> None:
         ("55AA0C04C5020000 DBD514FDF0", Reply.COMPLETE, "complete"),
     ],
 )
-def test_what_the_device_says_is_named(payloads: str, kind: Reply, shown: str) -> None:
+def test_what_the_device_sends_is_named(payloads: str, kind: Reply, shown: str) -> None:
     (heard,) = listen(payloads)
     assert heard.kind is kind
     assert str(heard) == shown
@@ -103,7 +103,7 @@ def test_what_the_device_says_is_named(payloads: str, kind: Reply, shown: str) -
         "11AA0C04C2020100",  # no header
     ],
 )
-def test_what_is_damaged_is_said_to_be(payloads: str) -> None:
+def test_what_is_damaged_is_called_damaged(payloads: str) -> None:
     assert [reply.kind for reply in listen(payloads)] == [Reply.DAMAGED]
 
 

@@ -56,7 +56,7 @@ def follow(found: list[Block], folder: Path, *, patient: bool) -> None:
 
 
 @pytest.mark.parametrize("page", FOLLOWED)
-def test_what_a_page_says_works(page: str, tmp_path: Path) -> None:
+def test_what_a_page_names_works(page: str, tmp_path: Path) -> None:
     follow(FOLLOWED[page], tmp_path, patient=False)
 
 

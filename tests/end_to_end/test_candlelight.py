@@ -170,7 +170,7 @@ def test_bus_off_that_somebody_ends_in_time_does_not_end_a_transfer(
 # -- a bus that cannot work -----------------------------------------------------------------------
 
 
-def test_nobody_acknowledges(bus: Candlelights, tmp_path: Path) -> None:
+def test_no_node_acknowledges(bus: Candlelights, tmp_path: Path) -> None:
     root(f"ip link set {bus.device} down")
     done = bus.flasher("flash", "image.bin", "-t", "bms", folder=tmp_path)
     assert done.end() == ExitCode.BUS

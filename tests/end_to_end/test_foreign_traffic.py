@@ -123,7 +123,7 @@ def test_error_frames_of_the_adapter_are_no_traffic() -> None:
     assert any(frame.is_error for frame in ids.received)
 
 
-def test_two_other_pairs_are_upgraded_at_the_same_time_and_nobody_notices_the_others() -> None:
+def test_two_other_pairs_are_upgraded_at_the_same_time_and_do_not_notice_each_other() -> None:
     """Other tools upgrade other devices: they speak as CDL too, but not to ours."""
     stage = Stage("bms")
     pairs = []

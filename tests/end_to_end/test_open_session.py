@@ -94,7 +94,7 @@ def test_an_open_session_is_found_without_a_power_cycle(
 
 
 @each("name", ["flash", "rescue"])
-def test_a_program_says_so_by_a_keyword(name: str) -> None:
+def test_a_program_waives_it_by_a_keyword(name: str) -> None:
     for is_async in (False, True):
         stage = left_in_session()
         connection = stage.connection()
@@ -166,7 +166,7 @@ def test_a_device_that_is_not_there_ends_it_within_the_limits_of_both_waits() ->
 
 
 @each("options", [OPEN, RESCUE])
-def test_a_rule_that_nobody_can_check_does_not_keep_it_from_being_found(
+def test_a_rule_that_no_one_can_check_does_not_keep_it_from_being_found(
     options: UpgradeOptions,
 ) -> None:
     stage = left_in_session()
@@ -178,7 +178,7 @@ def test_a_rule_that_nobody_can_check_does_not_keep_it_from_being_found(
     assert stage.has == IMAGE.data
 
 
-def test_an_application_that_tells_no_hardware_is_refused_as_without_the_option() -> None:
+def test_an_application_that_reports_no_hardware_is_refused_as_without_the_option() -> None:
     """A motor controller has no question for it, and answers the reset: no open session."""
     stage = Stage("wmc")
     identity = Identity(with_hardware("V1r2r0_*"), waived=frozenset({IdentityCheck.TARGET}))

@@ -236,7 +236,7 @@ def test_what_is_printed_after_a_lost_adapter_finishes_the_upgrade(
 
 
 @needs_candlelight
-def test_what_is_printed_when_nobody_acknowledges_succeeds(reader: Reader, tmp_path: Path) -> None:
+def test_what_is_printed_when_no_node_acknowledges_succeeds(reader: Reader, tmp_path: Path) -> None:
     bus = Candlelights()
     start(bus.tool)
     root(f"ip link set {bus.device} down")

@@ -379,7 +379,7 @@ def test_an_adapter_that_is_lost_while_the_version_is_asked_for_comes_back_to_th
     assert not stage.seen(events.AttemptStarted)
 
 
-def test_an_adapter_that_is_gone_while_the_version_is_asked_for_says_that_the_image_is_there() -> (
+def test_without_an_adapter_at_the_version_query_the_result_states_that_the_image_is_there() -> (
     None
 ):
     stage = Stage()

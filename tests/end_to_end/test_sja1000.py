@@ -57,7 +57,9 @@ def test_a_flash_at_once_after_the_interface_was_started(bus: Pair, tmp_path: Pa
 
 
 @pytest.mark.usefixtures("device")
-def test_doctor_has_nothing_to_say_of_an_interface_that_restarts(bus: Pair, tmp_path: Path) -> None:
+def test_doctor_has_nothing_to_report_of_an_interface_that_restarts(
+    bus: Pair, tmp_path: Path
+) -> None:
     done = bus.flasher("doctor", folder=tmp_path)
     assert done.end() == ExitCode.OK, done.said
     assert "after a bus-off" not in done.stdout

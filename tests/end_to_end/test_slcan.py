@@ -73,7 +73,7 @@ class Flashed:
         return claimed
 
 
-def test_an_upgrade_over_an_adapter_that_is_as_its_manual_says(adapter: Lawicel) -> None:
+def test_an_upgrade_over_an_adapter_that_follows_its_manual(adapter: Lawicel) -> None:
     flashed = Flashed(adapter)
     assert flashed.is_good
     assert flashed.health.unreadable == 0
@@ -223,7 +223,7 @@ def flash(adapter: Lawicel, *more: str) -> subprocess.CompletedProcess[str]:
         return run_flasher("flash", "image.bin", "-t", "bms", *bus, *more, folder=folder)
 
 
-def test_a_user_is_told_of_damaged_lines(adapter: Lawicel) -> None:
+def test_a_user_learns_of_damaged_lines(adapter: Lawicel) -> None:
     count = itertools.count(1)
 
     def damage(line: bytes) -> bytes:
@@ -237,7 +237,7 @@ def test_a_user_is_told_of_damaged_lines(adapter: Lawicel) -> None:
     assert f"{link['unreadable']} times the adapter delivered unreadable frames" in run.stderr
 
 
-def test_a_user_is_told_how_to_go_on_when_the_adapter_is_gone(adapter: Lawicel) -> None:
+def test_a_user_learns_how_to_go_on_when_the_adapter_is_gone(adapter: Lawicel) -> None:
     adapter.at_frame[100] = adapter.pull
     run = flash(adapter, "--adapter-wait", "0.5", "--no-bundle")
     assert run.returncode == ExitCode.BUS
@@ -248,7 +248,7 @@ def test_a_user_is_told_how_to_go_on_when_the_adapter_is_gone(adapter: Lawicel) 
 
 
 @pytest.mark.parametrize("words", [("info", "-t", "bms"), ("read", "serial-number", "-t", "bms")])
-def test_a_user_is_told_that_the_adapter_sends_nothing(
+def test_a_user_learns_that_the_adapter_sends_nothing(
     adapter: Lawicel, words: tuple[str, ...]
 ) -> None:
     adapter.program.refuses = lambda: True
@@ -260,7 +260,7 @@ def test_a_user_is_told_that_the_adapter_sends_nothing(
     assert "[E404]" in run.stderr
 
 
-def test_a_user_is_told_of_refused_frames(adapter: Lawicel) -> None:
+def test_a_user_learns_of_refused_frames(adapter: Lawicel) -> None:
     count = itertools.count(1)
     adapter.program.refuses = lambda: next(count) == 60
     run = flash(adapter, "--json", "--no-bundle")

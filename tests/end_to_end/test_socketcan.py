@@ -66,7 +66,7 @@ def test_images_of_every_edge_size_arrive_over_vcan(tmp_path: Path) -> None:
 
 
 @needs_vcan
-def test_nobody_on_vcan_is_exit_code_5(tmp_path: Path) -> None:
+def test_no_device_on_vcan_is_exit_code_5(tmp_path: Path) -> None:
     image = str(SAMPLES / "obc.bin")
     done = run("flash", image, "-t", "obc", *on("vcan0"), "--timeout", "1", folder=tmp_path)
     assert done.end() == ExitCode.NO_ANSWER, done.said
@@ -132,7 +132,9 @@ def taken_down(channel: str) -> Iterator[None]:
 
 
 @needs_pair
-def test_an_interface_that_goes_down_ends_the_upgrade_and_says_what_is_left(tmp_path: Path) -> None:
+def test_an_interface_that_goes_down_ends_the_upgrade_and_states_what_is_left(
+    tmp_path: Path,
+) -> None:
     """BU-05."""
     (tmp_path / "image.bin").write_bytes(VECTORS + random.Random(23).randbytes(59_984))
     with (

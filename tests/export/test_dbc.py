@@ -113,7 +113,7 @@ def test_names_are_short_enough_and_each_there_once() -> None:
     assert len(set(own)) >= 60
 
 
-def test_what_it_cannot_say_stands_in_it() -> None:
+def test_what_it_cannot_state_is_named_in_it() -> None:
     assert 'CM_ "' in dbc()
     assert "Left out is what a DBC cannot say: texts" in dbc()
 

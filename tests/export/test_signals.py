@@ -55,7 +55,7 @@ def test_frames_are_counted_as_wireshark_counts_them(trace: Path) -> None:
     assert numbers[-1] == len(list(read_trace(trace)))
 
 
-def test_a_file_that_is_cut_off_is_told(tmp_path: Path) -> None:
+def test_a_file_that_is_cut_off_is_reported(tmp_path: Path) -> None:
     path = Tape().to_end().save(tmp_path / "trace.log")
     path.write_text(path.read_text(encoding="ascii") + "(17000", encoding="ascii")
     with pytest.raises(UsageError):

@@ -140,7 +140,7 @@ def test_an_input_is_run_again_without_atheris(tmp_path: Path) -> None:
     assert "no harness" in done.stderr
 
 
-def test_without_atheris_the_command_says_where_it_is(
+def test_without_atheris_the_command_names_where_it_is(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(command, "find_spec", lambda _name: None)

@@ -55,7 +55,7 @@ script = st.lists(st.tuples(pauses, st.one_of(rows, rows, rows, frames)), max_si
 @pytest.mark.slow
 @given(script)
 @settings(max_examples=200, deadline=None, derandomize=True)
-def test_the_host_ends_explicitly_whatever_the_device_says(
+def test_the_host_ends_explicitly_whatever_the_device_answers(
     steps: list[tuple[float, UpgradeMessage | Frame]],
 ) -> None:
     bench = Bench(300, options=UpgradeOptions(timeout_s=TIMEOUT_S, attempts=2))

@@ -172,7 +172,7 @@ def test_an_adapter_that_is_back_while_copies_are_waited_for_waits_for_quiet_aga
     assert bench.expect(Packet).number == 3
 
 
-def test_an_adapter_that_is_back_at_the_end_says_the_end_again() -> None:
+def test_an_adapter_that_is_back_at_the_end_sends_the_end_again() -> None:
     bench = Bench(options=options(1))
     bench.to_end()
     bench.engine.link_back(bench.now)
@@ -284,7 +284,7 @@ def test_the_silence_is_counted_from_the_last_word_of_the_device() -> None:
     bench.expect(UpdateCommand, within_s=0.2)
 
 
-def test_a_device_that_answers_the_reset_is_reset_again_and_not_told_to_update() -> None:
+def test_a_device_that_answers_the_reset_is_reset_again_and_not_commanded_to_update() -> None:
     """Its application runs: R26 is for devices that do not even answer the reset."""
     bench = Bench(options=options(3))
     bench.to_request()

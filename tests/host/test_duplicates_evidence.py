@@ -136,7 +136,7 @@ def at(now: float) -> Watch:
 # -- questions ------------------------------------------------------------------------------------
 
 
-def test_a_question_with_two_answers_is_asked_again_and_says_nothing_yet() -> None:
+def test_a_question_with_two_answers_is_asked_again_and_decides_nothing_yet() -> None:
     assert asked(answers=1).ambiguous_queries == []
     watch = asked(answers=2)
     assert watch.ambiguous_queries == [VERSION]
@@ -219,7 +219,7 @@ def test_two_versions_are_two_devices_and_the_fields_that_differ_are_named() -> 
     }
 
 
-def test_values_that_change_are_no_second_device_but_tell_two_apart() -> None:
+def test_values_that_change_are_no_second_device_but_distinguish_two() -> None:
     watch = Watch().asks(RUNNING).answers(BATTERY, RUNNING).wait(100)
     watch.asks(RUNNING).answers(replace(BATTERY, mean_current_ma=-9), RUNNING)
     assert watch.evidence == ""
@@ -261,7 +261,7 @@ def test_a_question_of_somebody_else_has_an_answer_of_its_own() -> None:
     assert watch.answers().ambiguous_queries == [VERSION], "that was no question"
 
 
-def test_what_nobody_asked_for_is_no_answer() -> None:
+def test_what_no_one_asked_for_is_no_answer() -> None:
     watch = Watch().answers().answers()
     assert watch.ambiguous_queries == []
     assert watch.duplicates.contents == {}
@@ -460,7 +460,7 @@ def test_announcements_before_a_reset_are_not_compared() -> None:
     assert Watch().announces(0, 20, 44).sends(Command.RESET).announces(19).evidence == ""
 
 
-def test_bootloaders_that_alternate_are_two_also_where_neither_hears_an_update_command() -> None:
+def test_bootloaders_that_alternate_are_two_also_where_neither_receives_an_update_command() -> None:
     watch = Watch().announces(0, 44, 20).sends(Command.UPDATE).announces(43, 20)
     assert watch.evidence == ALTERNATELY
 
@@ -758,7 +758,7 @@ def test_in_the_transfer_one_feedback_too_many_is_an_odd_answer() -> None:
     assert watch.evidence == TOO_OFTEN
 
 
-def test_what_was_seen_first_is_what_is_told() -> None:
+def test_what_was_seen_first_is_what_is_reported() -> None:
     watch = Watch().sends(Command.RESET).hears(GeneralFeedbackMessage(), GeneralFeedbackMessage())
     assert watch.announces(1).announces(1, boot=BootVersion("BMS", "V9.9.9")).evidence == (
         CONFIRMED_TWICE

@@ -170,7 +170,7 @@ def test_another_version_after_a_lost_final_answer_fails() -> None:
     assert NEW in str(error)
 
 
-def test_a_version_that_cannot_be_compared_leaves_it_unconfirmed_and_is_told() -> None:
+def test_a_version_that_cannot_be_compared_leaves_it_unconfirmed_and_is_reported() -> None:
     bench = Bench(200)
     bench.to_end()
     bench.wait(31.0)
@@ -379,7 +379,7 @@ def test_complete_after_the_first_boot_version_still_completes() -> None:
         ("to_end", DeviceLeft.UNKNOWN),
     ],
 )
-def test_cancelling_tells_what_state_the_device_is_left_in(reach: str, left: DeviceLeft) -> None:
+def test_cancelling_reports_what_state_the_device_is_left_in(reach: str, left: DeviceLeft) -> None:
     bench = Bench(200)
     getattr(bench, reach)()
     sent = len(bench.sent)

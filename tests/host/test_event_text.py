@@ -102,7 +102,7 @@ def test_an_event_that_other_means_show_has_no_line(event: object) -> None:
         (events.AdapterBack(), ""),
     ],
 )
-def test_what_nobody_should_miss_is_a_warning(event: object, words: str) -> None:
+def test_what_no_one_should_miss_is_a_warning(event: object, words: str) -> None:
     assert warning_text(event) == words
 
 

@@ -250,7 +250,7 @@ def test_a_boot_version_from_before_an_outage_is_not_answered_after_it() -> None
     assert bench.outcome.ending is Ending.NO_REQUEST
 
 
-def test_a_device_that_announces_into_each_update_command_does_not_hear() -> None:
+def test_a_device_that_announces_into_each_update_command_does_not_receive_it() -> None:
     bench = _announced_while_the_command_leaves()
     first_at = bench.now
     while not bench.engine.done:
@@ -288,7 +288,7 @@ def test_request_transfer_may_come_up_to_ten_seconds_after_the_update_command(
         assert bench.expect(Packet).number == 1
 
 
-def test_a_bootloader_that_announces_on_and_on_without_hearing_ends_in_bounded_time() -> None:
+def test_a_bootloader_that_announces_on_and_on_and_reads_nothing_ends_in_bounded_time() -> None:
     bench = Bench()
     bench.to_boot()
     for _ in range(400):
@@ -338,7 +338,7 @@ def test_another_device_or_no_version_is_refused_before_anything_is_sent_to_it(
     assert bench.unread == []
 
 
-def test_another_boot_name_is_taken_when_the_user_says_so() -> None:
+def test_another_boot_name_is_taken_when_the_user_allows_it() -> None:
     bench = Bench(options=UpgradeOptions(allow_boot_name=True))
     bench.to_boot()
     bench.say(BootVersion("XYZ", "hello!"))

@@ -40,12 +40,12 @@ def sent(frames: list[Frame]) -> MarkedGuard:
 
 
 @each("step", [2, 3, 7])
-def test_echoes_of_which_some_are_missing_are_nobody(step: int) -> None:
+def test_echoes_of_which_some_are_missing_are_no_second_tool(step: int) -> None:
     made = sent(OWN)
     assert all(made.see(frame, 1.01) is None for frame in OWN[::step])
 
 
-def test_a_frame_that_was_not_sent_is_somebody_else_and_is_told_in_hex() -> None:
+def test_a_frame_that_was_not_sent_is_from_another_sender_and_is_reported_in_hex() -> None:
     found = sent(OWN).see(OTHER, 1.01)
     assert found is not None
     assert "55 aa 16 07" in found.description
@@ -139,7 +139,7 @@ def frames_of(can_id: int, mode: int, command: int, data: bytes) -> list[Frame]:
 
 
 @each("target", [BMS, OBC])
-def test_the_batterys_shutdown_is_noticed_whatever_the_target_and_told_once(
+def test_the_batterys_shutdown_is_noticed_whatever_the_target_and_reported_once(
     target: Target,
 ) -> None:
     made = guard(target)

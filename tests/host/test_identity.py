@@ -99,7 +99,7 @@ PASSED, UNKNOWN, REFUSED, WARNED = (
          {HARDWARE: UNKNOWN, PREVIOUS: REFUSED, DOWNGRADE: PASSED}),
     ],
 )  # fmt: skip
-def test_what_the_device_says_of_the_image(
+def test_what_the_device_reports_of_the_image(
     stated: dict[str, object] | None,
     device: DeviceAnswers,
     expected: dict[IdentityCheck, CheckVerdict],
@@ -108,7 +108,7 @@ def test_what_the_device_says_of_the_image(
     assert dict(verdicts(judge_device(IMAGE, BMS, identity, device))) == expected
 
 
-def test_a_device_that_tells_no_version_cannot_be_compared_and_that_is_said() -> None:
+def test_a_device_that_reports_no_version_cannot_be_compared_and_that_is_reported() -> None:
     found = list(judge_device(IMAGE, OBC, Identity(), DeviceAnswers()))
     assert len(found) == 1
     assert "the OBC's application reported no version" in found[0].text
@@ -144,7 +144,7 @@ def test_the_state_of_the_battery(
     } == (expected)
 
 
-def test_a_waived_check_is_told_and_ends_nothing() -> None:
+def test_a_waived_check_is_reported_and_ends_nothing() -> None:
     refused = Identity().refusal(IdentityCheck.DOWNGRADE, "older")
     waived = Identity(waived=frozenset({IdentityCheck.DOWNGRADE})).refusal(
         IdentityCheck.DOWNGRADE, "older"
@@ -166,7 +166,7 @@ def test_the_same_version_is_skipped_on_request_only() -> None:
     assert found[IdentityCheck.SAME_VERSION] is CheckVerdict.SKIPPED
 
 
-def test_what_a_device_tells_is_shown_escaped() -> None:
+def test_what_a_device_reports_is_shown_escaped() -> None:
     texts = (
         b"BM36.".ljust(16),
         b"W1.".ljust(16),
@@ -236,7 +236,7 @@ def test_a_manifest_vouches_for_its_very_bytes_only() -> None:
     )
 
 
-def test_what_says_that_the_image_is_for_the_target() -> None:
+def test_what_shows_that_the_image_is_for_the_target() -> None:
     assert judged()[IdentityCheck.TARGET].text.startswith(
         "no manifest, and the image names no device"
     )
@@ -390,7 +390,7 @@ def test_the_same_version_ends_the_session_where_it_is_skipped() -> None:
     assert found.event == CheckMade("same-version", "skipped", f"the device already runs {NEW}")
 
 
-def test_only_the_battery_tells_its_state_even_without_a_version() -> None:
+def test_only_the_battery_reports_its_state_even_without_a_version() -> None:
     device = DeviceAnswers(running=replace(BATTERY, mean_current_ma=-1500))
     assert judged(device=device)[IdentityCheck.IN_USE].verdict is REFUSED
     assert device.hardware_version is None

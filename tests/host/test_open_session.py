@@ -118,7 +118,7 @@ def test_a_session_that_is_lost_again_is_another_attempt_of_those_that_were_allo
 
 
 @each("options", [OPEN, RESCUE])
-def test_an_application_that_answers_the_reset_is_never_told_to_update_unasked(
+def test_an_application_that_answers_the_reset_is_never_commanded_to_update_unasked(
     options: UpgradeOptions,
 ) -> None:
     bench = Bench(options=options)
@@ -179,7 +179,7 @@ def test_the_silence_is_counted_from_the_last_message_of_the_device() -> None:
 
 
 @each("options", [OPEN, RESCUE])
-def test_an_adapter_that_was_away_has_heard_nothing_meanwhile(options: UpgradeOptions) -> None:
+def test_an_adapter_that_was_away_has_received_nothing_meanwhile(options: UpgradeOptions) -> None:
     """Nor an answer to the reset, which is sent again."""
     bench = Bench(options=options)
     bench.wait(6.0)
@@ -221,7 +221,7 @@ def test_an_adapter_that_is_back_while_the_power_is_waited_for_sends_nothing() -
     bench.expect(UpdateCommand)
 
 
-def test_a_rescue_that_nobody_answers_ends_after_one_wait_for_the_power() -> None:
+def test_a_rescue_that_no_device_answers_ends_after_one_wait_for_the_power() -> None:
     bench = Bench(options=RESCUE)
     to_silence(bench)
     bench.wait(ERASE_S + 30.1)
@@ -307,7 +307,7 @@ def test_after_the_session_was_found_the_rule_is_no_matter_any_more() -> None:
     assert bench.outcome.ok
 
 
-def test_a_bootloader_version_that_nobody_told_is_reported_as_unknown() -> None:
+def test_a_bootloader_version_that_no_device_reported_is_reported_as_unknown() -> None:
     bench = Bench(options=replace(OPEN, minimum_boot_version="V9.0.0"))
     to_silence(bench)
     finish(bench)

@@ -76,7 +76,7 @@ def test_the_default_is_three_attempts() -> None:
     assert UpgradeOptions(attempts=1).planned_attempts == 1
 
 
-def test_only_a_battery_can_be_asked_for_its_version_unless_a_product_says_how() -> None:
+def test_only_a_battery_can_be_asked_for_its_version_unless_a_product_states_how() -> None:
     own = Request(BY_KEY[0x752, 0x3400])
     assert UpgradeOptions().version_request_for(BMS) == Request(BY_KEY[0x752, 0x3300])
     assert UpgradeOptions().version_request_for(OBC) is None

@@ -142,7 +142,7 @@ def test_an_unusual_frame_gap_is_a_likely_cause_of_silence_only(ending: Ending) 
     assert "apart" not in usual.cause
 
 
-def test_what_was_seen_stands_in_brackets_and_the_waiver_is_named() -> None:
+def test_what_was_seen_is_in_brackets_and_the_waiver_is_named() -> None:
     seen = outcome(Ending.WRONG_DEVICE, detail="boot version 'OBC'").error()
     assert seen is not None
     assert seen.what == "BMS: another device answers (boot version 'OBC')."

@@ -95,7 +95,7 @@ def test_a_device_that_always_restarts_is_not_erased_for_ever() -> None:
     assert bench.outcome.device_left is DeviceLeft.NO_APPLICATION
 
 
-def test_each_attempt_tells_how_much_time_is_left() -> None:
+def test_each_attempt_reports_how_much_time_is_left() -> None:
     bench = Bench(options=UpgradeOptions(timeout_s=100.0))
     bench.to_request()
     bench.wait(1.0)
@@ -213,7 +213,7 @@ def test_a_refused_image_is_refused_at_once() -> None:
     assert bench.outcome.statistics.attempts == 1
 
 
-def test_a_bootloader_that_does_not_hear_any_more_is_told_again() -> None:
+def test_a_bootloader_that_no_longer_receives_is_commanded_again() -> None:
     bench = Bench(options=PATIENT)
     bench.to_transfer()
     bench.wait(0.07)
@@ -301,7 +301,7 @@ def test_another_tool_after_the_end_of_transfer_ends_it() -> None:
 
 
 @each("state", ["erasing", "transfer"])
-def test_another_tool_is_waited_for_once_the_device_was_told_to_erase(state: str) -> None:
+def test_another_tool_is_waited_for_once_the_device_was_commanded_to_erase(state: str) -> None:
     bench = Bench(options=UpgradeOptions())
     if state == "erasing":
         bench.to_request()

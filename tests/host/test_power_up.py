@@ -40,7 +40,7 @@ def test_the_announcement_is_answered_before_the_next_one() -> None:
     assert bench.expect(Packet).number == 1
 
 
-def test_every_announcement_of_the_burst_is_answered_until_one_is_heard() -> None:
+def test_every_announcement_of_the_burst_is_answered_until_one_is_received() -> None:
     bench = Bench(options=WAITING)
     for _ in range(4):
         bench.say(BOOT)
@@ -51,7 +51,7 @@ def test_every_announcement_of_the_burst_is_answered_until_one_is_heard() -> Non
 
 
 @each("row", [GeneralFeedbackMessage(), RequestTransfer()])
-def test_nothing_else_that_the_device_says_is_answered(row: GeneralFeedbackMessage) -> None:
+def test_nothing_else_that_the_device_sends_is_answered(row: GeneralFeedbackMessage) -> None:
     bench = Bench(options=WAITING)
     bench.say(row)
     bench.wait(1.0)

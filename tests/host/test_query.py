@@ -119,7 +119,7 @@ def test_an_unanswered_question_is_repeated_every_200_ms_and_given_up_after_one_
     ]
 
 
-def test_of_a_quiet_question_nothing_is_told() -> None:
+def test_of_a_quiet_question_nothing_is_reported() -> None:
     for is_quiet in (True, False):
         query = Query(Request(READ_VERSION), quiet=is_quiet)
         bench: Bench[Runner[Query]] = Bench(Runner(partial(ask_one, query=query), bitrate_bps=RATE))
@@ -398,7 +398,9 @@ def counting(*items: Item) -> Bench[Queries]:
     return Bench(Queries([Request(item) for item in items], bitrate_bps=RATE, counts=True))
 
 
-def test_a_question_that_is_answered_twice_is_asked_again_and_then_two_devices_are_told() -> None:
+def test_a_question_that_is_answered_twice_is_asked_again_and_then_two_devices_are_reported() -> (
+    None
+):
     bench = counting(READ_RUNNING, READ_VERSION)
     bench.run(1.05)
     bench.say(0x720, 0x0C, 0x1540, VERSION)

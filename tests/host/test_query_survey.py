@@ -105,7 +105,7 @@ def test_nothing_is_sent_while_it_listens() -> None:
     assert (frame.can_id, frame.data[4:6].hex()) == (0x752, "3300")
 
 
-def test_what_is_heard_while_listening_belongs_to_its_sender() -> None:
+def test_what_is_received_while_listening_belongs_to_its_sender() -> None:
     engine = survey()
     engine.tick(0.0)
     for part in payloads(build(0x732, 0x11, 0x5000, b"")):
@@ -206,7 +206,7 @@ def test_a_device_that_is_silent_to_three_questions_is_asked_no_more(
     assert not engine.cancelled
 
 
-def test_a_tool_that_is_heard_while_listening_is_not_disturbed_by_questions() -> None:
+def test_a_tool_that_is_detected_while_listening_is_not_disturbed_by_questions() -> None:
     engine = survey()
     engine.tick(0.0)
     engine.receive(Frame(0x752, bytes.fromhex("55AA1687A3850101")), 0.5)
@@ -258,7 +258,7 @@ def test_the_echo_of_an_own_frame_is_no_other_tool_but_a_second_one_is() -> None
     assert engine.heard[Node.CDL].messages.total() == 1
 
 
-def test_cancelled_in_a_question_it_is_done_and_says_so() -> None:
+def test_cancelled_in_a_question_it_is_done_and_reported_as_cancelled() -> None:
     engine = survey(listen_s=0.0)
     engine.tick(0.0)
     engine.tick(0.0)

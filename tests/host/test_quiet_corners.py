@@ -94,7 +94,7 @@ def test_a_check_that_is_done_does_nothing_more() -> None:
     assert check.done
 
 
-def test_a_session_says_where_it_stands_in_the_upgrade_and_in_the_check() -> None:
+def test_a_session_states_where_it_is_in_the_upgrade_and_in_the_check() -> None:
     bench = Bench(100)
     session = UpgradeSession(plan(bench.image, BMS, WELLING.bitrate_bps), level=Level.VERSION)
     bench.engine = session  # type: ignore[assignment]

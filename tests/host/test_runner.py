@@ -60,7 +60,7 @@ def test_it_wants_to_be_woken_at_the_earliest_of_all_times() -> None:
     assert made.deadline() is None
 
 
-def test_what_is_on_other_ids_or_is_no_payload_is_not_heard() -> None:
+def test_what_is_on_other_ids_or_is_no_payload_is_not_received() -> None:
     made, came = runner(0x720)
     for part in parts(0x721):
         made.receive(Frame(0x721, part), 1.0)
@@ -71,7 +71,7 @@ def test_what_is_on_other_ids_or_is_no_payload_is_not_heard() -> None:
     assert came == [Message(0x720, 0x0C, 0x1204, bytes((4, 0, 1, 0)))]
 
 
-def test_what_is_heard_always_stays_when_something_else_is_listened_for() -> None:
+def test_what_is_received_always_stays_when_something_else_is_listened_for() -> None:
     made, came = runner()
     made.listen_always(0x720)
     made.also_listen_on(0x730)

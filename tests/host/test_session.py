@@ -95,7 +95,7 @@ def test_another_version_than_the_image_names_is_exit_code_10() -> None:
     assert "completed, but" in str(error)
 
 
-def test_an_image_without_a_version_is_not_compared_and_that_is_said() -> None:
+def test_an_image_without_a_version_is_not_compared_and_that_is_reported() -> None:
     result, _ = run(Level.VERSION, Image.from_bytes(bytes(200)))
     assert result.ok
     assert result.verification.verdict is Verdict.VERSION_UNJUDGED
@@ -239,7 +239,7 @@ def test_an_image_that_lies_at_zero_is_read_from_there() -> None:
 
 
 @each("size_bytes, verdict", [(200, Verdict.INTERRUPTED), (100, Verdict.MEMORY_RIGHT)])
-def test_a_memory_check_that_is_cancelled_after_an_answer_says_so_unless_it_has_all(
+def test_a_memory_check_that_is_cancelled_after_an_answer_is_cancelled_unless_it_has_all(
     size_bytes: int, verdict: Verdict
 ) -> None:
     """The question was repeated: the answer to the other copy may still come."""
@@ -257,7 +257,7 @@ def test_a_memory_check_that_is_cancelled_after_an_answer_says_so_unless_it_has_
     )
 
 
-def test_a_memory_check_that_is_cancelled_in_a_question_says_so() -> None:
+def test_a_memory_check_that_is_cancelled_in_a_question_is_reported_as_cancelled() -> None:
     check = memory_check(planned(), UpgradeOptions(), NEW)
     Application(check).next_question()
     check.cancel(0.1)
@@ -542,7 +542,7 @@ def test_a_version_check_that_is_cancelled_after_an_answer_asks_no_more(
 
 
 @each("asked", [True, False])
-def test_cancelling_a_check_says_that_the_upgrade_was_complete(*, asked: bool) -> None:
+def test_cancelling_a_check_states_that_the_upgrade_was_complete(*, asked: bool) -> None:
     check = version_check(planned(), UpgradeOptions())
     application = Application(check)
     if asked:

@@ -66,7 +66,7 @@ def test_a_second_tool_after_the_users_word_stops_the_rest_of_the_message() -> N
     assert engine.outcome.ending is Ending.CANCELLED
 
 
-def test_a_session_that_has_ended_hears_and_sends_nothing_any_more() -> None:
+def test_a_session_that_has_ended_receives_and_sends_nothing_any_more() -> None:
     session = UpgradeSession(PLAN)
     session.tick(0.0)
     session.cancel(0.0)
@@ -84,7 +84,7 @@ def test_a_session_that_has_ended_hears_and_sends_nothing_any_more() -> None:
     assert session.next_frame(10.0) is None
 
 
-def test_a_session_without_identity_asks_nobody_and_checks_nothing() -> None:
+def test_a_session_without_identity_asks_no_one_and_checks_nothing() -> None:
     session = UpgradeSession(PLAN)
     session.tick(0.0)
     assert session.next_frame(0.0) is None
@@ -115,7 +115,7 @@ class OnlyFirmware(Content):
     firmware_version: WireText = field(TextField(16))  # noqa: RUF009  as in contents
 
 
-def test_a_device_that_does_not_tell_its_hardware_is_refused_as_one_that_does_not_fit() -> None:
+def test_a_device_that_does_not_report_its_hardware_is_refused_as_one_that_does_not_fit() -> None:
     release = release_of(IMAGE, BMS, hardware_versions=["V1r2r0_*"])
     told = DeviceAnswers(OnlyFirmware(WireText(encode_text("V1r0r0_20220512", 16))))
     findings = list(judge_device(IMAGE, BMS, Identity(release), told))

@@ -140,7 +140,7 @@ def test_without_an_identity_nothing_is_asked_and_no_version_is_known() -> None:
     assert dialogue.seen(events.CheckMade) == []
 
 
-def test_the_first_check_that_refuses_ends_it_and_all_are_told() -> None:
+def test_the_first_check_that_refuses_ends_it_and_all_are_reported() -> None:
     rules = release_of(IMAGE, BMS, hardware_versions=["V9*"])
     dialogue = Dialogue(identity=Identity(rules))
     dialogue.identified("V3r0r0_20260301")
@@ -361,7 +361,7 @@ def test_the_deadline_in_the_verification_leaves_it_without_an_answer() -> None:
 # -- another tool ---------------------------------------------------------------------------------
 
 
-def test_a_query_of_another_tool_in_the_transfer_is_told_by_its_title_once() -> None:
+def test_a_query_of_another_tool_in_the_transfer_is_reported_by_its_title_once() -> None:
     dialogue = Dialogue()
     dialogue.to_packet(1)
     for command in (0x3300, 0x3300, 0x7700, 0x3400):
@@ -390,7 +390,7 @@ def test_a_query_of_another_tool_before_the_update_command_ends_it() -> None:
 
 
 @each("end", [Ending.CANCELLED, Ending.COMPLETED])
-def test_a_battery_that_switches_off_is_told_and_kept(end: Ending) -> None:
+def test_a_battery_that_switches_off_is_reported_and_kept(end: Ending) -> None:
     dialogue = Dialogue(identity=Identity() if end is Ending.CANCELLED else None)
     shutdown = catalogue.encode(SHUTDOWN, SHUTDOWN.content())
     for _ in range(2):
@@ -543,7 +543,7 @@ def test_a_question_that_was_cut_short_is_not_gone_on_with() -> None:
         (Ending.NOT_FOR_DEVICE, 2.04, True, "another file was meant"),
     ],
 )  # fmt: skip
-def test_a_pause_or_a_shutdown_is_a_cause_only_where_nobody_answered(
+def test_a_pause_or_a_shutdown_is_a_cause_only_where_no_device_answered(
     ending: Ending, stalled_s: float, begins: str, *, shutdown: bool
 ) -> None:
     outcome = ended_before_start(PLAN, ending, "", duration_s=1.0)

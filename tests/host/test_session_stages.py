@@ -130,7 +130,7 @@ def test_a_second_tool_cuts_a_message_short_that_was_finished_for_a_clean_end() 
 
 
 @each("target", ["bms", "obc"])
-def test_a_tool_that_flashes_is_heard_before_anything_is_sent(target: str) -> None:
+def test_a_tool_that_flashes_is_detected_before_anything_is_sent(target: str) -> None:
     """The OBC cannot be asked: before its reset nothing else would have told."""
     stage = Stage(target)
     packet = Frame(stage.target.request_id, bytes.fromhex("0102030405060708"))
@@ -228,7 +228,7 @@ def test_echoes_of_own_frames_are_no_second_tool(
     assert not stage.seen(events.MessageRepeated)
 
 
-def test_a_second_tool_is_heard_among_echoes() -> None:
+def test_a_second_tool_is_detected_among_echoes() -> None:
     stage, witness = Stage(), Witness()
     stage.wrap = lambda link: Echoing(link, stage, lambda _number: 1, 0.001)
     stage.at_packet[2] = lambda: stage.bus.attach(
@@ -340,7 +340,7 @@ def with_another(stage: Stage, **differs: str) -> MockDevice:
 
 
 @each("differs", [{"serial_number": "W2605002"}, {"factory_version": "V1r0r1_20230512"}])
-def test_two_devices_that_tell_different_versions_are_refused_before_the_reset(
+def test_two_devices_that_report_different_versions_are_refused_before_the_reset(
     differs: dict[str, str],
 ) -> None:
     stage = Stage()
@@ -524,7 +524,7 @@ def test_a_device_that_is_always_just_in_time_is_upgraded_or_ends_with_the_deadl
     assert stage.clock.now() <= default_timeout_s(stage.plan(), options) + 0.5
 
 
-def test_nobody_who_acknowledges_is_told_from_a_device_that_is_silent() -> None:
+def test_a_bus_without_acknowledgement_is_distinguished_from_a_device_that_is_silent() -> None:
     alone, silent = Stage(), Stage()
     alone.bus.is_unacknowledged = True
     silent.cut_power()
@@ -534,7 +534,7 @@ def test_nobody_who_acknowledges_is_told_from_a_device_that_is_silent() -> None:
     assert silent.flash().exit_code == ExitCode.NO_ANSWER
 
 
-def test_a_session_that_went_well_says_what_runs() -> None:
+def test_a_session_that_went_well_states_what_runs() -> None:
     stage = Stage()
     result = stage.flash()
     assert (result.exit_code, result.running_version) == (ExitCode.OK, NEW)

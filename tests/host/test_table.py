@@ -109,7 +109,7 @@ def test_after_end_of_transfer_only_a_device_beyond_its_burst_gets_an_update_com
     } == {"take_boot_after_end"}
 
 
-def test_an_update_command_answers_something_the_device_said_or_one_long_silence() -> None:
+def test_an_update_command_answers_a_message_of_the_device_or_one_long_silence() -> None:
     """R2, R26."""
     for state, event, action, leads_to in moves():
         if UpgradeState.AWAITING_REQUEST in leads_to and state is not UpgradeState.AWAITING_REQUEST:

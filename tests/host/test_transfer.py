@@ -267,7 +267,7 @@ def test_both_copies_refused_is_one_more_try() -> None:
     assert bench.expect(Packet).number == 2
 
 
-def test_nak_n_plus_1_for_a_repeated_packet_counts_only_where_the_profile_says_so() -> None:
+def test_nak_n_plus_1_for_a_repeated_packet_counts_only_where_the_profile_allows_it() -> None:
     for allowed, expected in ((True, 2), (False, 1)):
         bench = Bench(options=UpgradeOptions(nak_next_is_ack=allowed))
         bench.to_packet(1)

@@ -47,7 +47,7 @@ def reported(bench: Bench) -> list[str]:
 # -- where it stands ------------------------------------------------------------------------------
 
 
-def test_it_says_where_it_stands_with_packet_and_attempt() -> None:
+def test_it_states_where_it_is_with_packet_and_attempt() -> None:
     bench = Bench(options=UpgradeOptions(timings=HURRIED))
     stands = [stage(bench).progress]
     bench.to_boot()
@@ -303,7 +303,7 @@ def test_a_bootloader_that_names_no_version_is_refused_where_one_is_asked_for() 
     assert bench.outcome.ending is Ending.BOOT_TOO_OLD
 
 
-def test_each_attempt_tells_the_boot_version_once() -> None:
+def test_each_attempt_reports_the_boot_version_once() -> None:
     bench = Bench(options=UpgradeOptions(timings=HURRIED))
     bench.to_packet(2)
     bench.now += 0.1
@@ -497,7 +497,7 @@ def test_a_request_that_never_comes_is_missed_although_the_adapter_was_lost_mean
     assert bench.outcome.ending is Ending.NO_REQUEST
 
 
-def test_a_boot_version_after_an_update_command_into_the_silence_is_told() -> None:
+def test_a_boot_version_after_an_update_command_into_the_silence_is_reported() -> None:
     bench = Bench(options=replace(ONCE, in_session=True))
     bench.wait(10.1)
     assert isinstance(bench.unread[-1], UpdateCommand)
@@ -509,7 +509,7 @@ def test_a_boot_version_after_an_update_command_into_the_silence_is_told() -> No
     assert bench.seen(events.BootVersionSeen) == [events.BootVersionSeen("BMS", "V1.2.3")]
 
 
-def test_an_erased_device_that_announces_on_and_on_is_reset_and_told_again() -> None:
+def test_an_erased_device_that_announces_on_and_on_is_reset_and_commanded_again() -> None:
     bench = Bench()
     bench.to_packet(2)
     bench.now += 0.1
@@ -543,7 +543,7 @@ def test_no_request_after_a_failed_packet_is_named_by_whether_the_device_came_ba
     assert bench.outcome.packet == (2 if ending is Ending.PACKET_FAILED else None)
 
 
-def test_nobody_is_asked_for_power_before_an_update_command_went_into_the_silence() -> None:
+def test_no_power_cycle_is_asked_for_before_an_update_command_went_into_the_silence() -> None:
     bench = Bench(options=UpgradeOptions(timings=HURRIED))
     bench.to_packet(2)
     bench.now += 0.1

@@ -158,7 +158,9 @@ def test_announcements_that_go_on_are_those_of_one_bootloader_that_confirms_ever
 # -- a device that was heard before ---------------------------------------------------------------
 
 
-def test_a_device_that_was_heard_gets_a_reset_that_only_another_application_answers() -> None:
+def test_a_device_that_announced_itself_gets_a_reset_that_only_another_application_answers() -> (
+    None
+):
     bench = heard_before()
     assert bench.seen(events.PhaseEntered) == [events.PhaseEntered(Phase.BOOT, 1)]
     assert bench.seen(events.BootVersionSeen) == [events.BootVersionSeen("BMS", "V1.2.3")]
@@ -201,7 +203,7 @@ def test_an_application_that_answers_that_reset_is_waited_for() -> None:
     bench.expect(UpdateCommand, within_s=WATCH_S + 3 * FRAME_S)
 
 
-def test_at_power_up_it_gets_no_reset_and_nobody_is_asked_for_power() -> None:
+def test_at_power_up_it_gets_no_reset_and_no_power_cycle_is_asked_for() -> None:
     bench = heard_before(AWAITED)
     announced_at = bench.now
     assert begins(bench, UpdateCommand) == pytest.approx(announced_at + WATCH_S)
@@ -224,7 +226,7 @@ def test_an_upgrade_begins_with_the_reset_or_with_the_wait(
     assert bool(bench.seen(events.PowerCycleAwaited)) is (phase is Phase.BOOT)
 
 
-def test_before_it_begins_it_says_what_it_will_begin_with() -> None:
+def test_before_it_begins_it_states_what_it_will_begin_with() -> None:
     planned = plan(Bench().image, BMS, WELLING.bitrate_bps)
     for options, text in ((UpgradeOptions(), "resetting"), (AWAITED, "waiting for the boot")):
         assert Upgrade(planned, options)._upgrade.progress.startswith(text)

@@ -41,7 +41,7 @@ DIFFERS = "but reads back place 'WUXI' instead of 'SUZHOU'."
         (False, MADE, "did not confirm it; it does read back as written."),
     ],
 )
-def test_the_error_says_what_is_missing_or_the_first_field_that_differs(
+def test_the_error_states_what_is_missing_or_the_first_field_that_differs(
     *, is_confirmed: bool, read_back: Content | None, what: str
 ) -> None:
     error = WriteResult(PLAN, None, is_confirmed=is_confirmed, read_back=read_back).error()

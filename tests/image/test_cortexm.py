@@ -106,7 +106,7 @@ def test_what_does_not_look_like_a_cortex_m_is_not_refused() -> None:
     check_starts_inside(image(0xDEAD_BEEF, 0x0800_0101))
 
 
-def test_without_a_base_nothing_is_refused_and_that_is_said() -> None:
+def test_without_a_base_nothing_is_refused_and_that_is_reported() -> None:
     program = image(STACK, 0x0800_0101, base=None)
     check_starts_inside(program)
     table = vector_table(program)
@@ -116,7 +116,7 @@ def test_without_a_base_nothing_is_refused_and_that_is_said() -> None:
     assert "--base" in table.notes[0]
 
 
-def test_without_a_base_vectors_further_apart_than_the_image_is_long_are_told() -> None:
+def test_without_a_base_vectors_further_apart_than_the_image_is_long_are_reported() -> None:
     near = vector_table(image(STACK, BASE + 1, BASE + 0x1001 - 2, 0, base=None))
     far = vector_table(image(STACK, BASE + 1, 0, BASE + 0x1001, base=None))
     assert near is not None
@@ -137,7 +137,7 @@ def test_vectors_of_one_program_lie_within_16_mib(apart: int, *, is_near: bool) 
     )
 
 
-def test_a_vector_table_at_an_odd_place_is_told() -> None:
+def test_a_vector_table_at_an_odd_place_is_reported() -> None:
     table = vector_table(image(STACK, BASE + 0x101, base=BASE + 0x10))
     assert table is not None
     assert not table.plausible
@@ -153,7 +153,7 @@ def merged(count: int) -> Image:
     return Image.from_bytes(bytes(data), base=BASE)
 
 
-def test_a_second_program_inside_the_image_is_told() -> None:
+def test_a_second_program_inside_the_image_is_reported() -> None:
     table = vector_table(merged(1))
     assert table is not None
     assert not table.problems
@@ -188,7 +188,7 @@ def test_a_vector_that_is_empty_lies_nowhere(nothing: int, base: int | None) -> 
     assert not table.problems
 
 
-def test_of_an_image_that_is_no_program_no_more_is_said_than_that() -> None:
+def test_of_an_image_that_is_no_program_no_more_is_reported_than_that() -> None:
     """Neither that its base is odd, nor that another program stands in it, nor how to judge it."""
     inner = (STACK, BASE + 0x301, BASE + 0x303, BASE + 0x305)
     words = (0, BASE + 5, *(0,) * 126, *inner)

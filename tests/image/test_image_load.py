@@ -156,7 +156,7 @@ def test_the_merged_file_rule_can_be_waived() -> None:
         ("bms.bin", "app", "raw binary"),
     ],
 )
-def test_the_content_tells_the_format_before_the_suffix(
+def test_the_content_decides_the_format_before_the_suffix(
     sample: str, name: str, expected: str, tmp_path: Path
 ) -> None:
     assert load(write(tmp_path, name, (SAMPLES / sample).read_bytes())).format == expected
@@ -216,7 +216,7 @@ def test_a_forced_format_must_fit_the_content() -> None:
 # -- options ------------------------------------------------------------------------------------
 
 
-def test_a_raw_binary_has_no_address_until_the_user_says_one() -> None:
+def test_a_raw_binary_has_no_address_until_the_user_gives_one() -> None:
     image = load(SAMPLES / "obc.bin")
     assert (image.base, image.segments) == (None, (AddressSpan(0, 4000),))
     placed = load(SAMPLES / "obc.bin", base=0x0800_2000)
@@ -375,7 +375,7 @@ def test_the_largest_binary_is_loaded_and_one_byte_more_is_not(tmp_path: Path) -
 # -- what is known about an image ---------------------------------------------------------------
 
 
-def test_an_image_says_its_source_hash_and_version() -> None:
+def test_an_image_states_its_source_hash_and_version() -> None:
     image = load(str(SAMPLES / "bms.bin"))
     assert image.source == str(SAMPLES / "bms.bin")
     assert image.sha256 == hashlib.sha256(image.data).hexdigest()

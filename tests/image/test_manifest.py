@@ -203,7 +203,7 @@ def test_bytes_that_differ_are_refused_with_both_values(
     assert "the bytes to send have" in refused.value.where
 
 
-def test_each_statement_stands_beside_what_the_bytes_have() -> None:
+def test_each_statement_comes_with_the_bytes() -> None:
     other = replace(IMAGE, data=b"OBC" + IMAGE.data[3:])
     findings = release().findings(other)
     compared = {each.key: (each.stated, each.found, each.agrees) for each in findings}

@@ -37,7 +37,7 @@ def test_both_names_and_the_update_text_name_a_target(target: Target) -> None:
         VERSION + bytes(NEIGHBOURHOOD_SIZE - 3) + b"BMS",
     ],
 )
-def test_a_name_before_or_behind_a_version_counts(data: bytes) -> None:
+def test_a_name_before_or_after_a_version_counts(data: bytes) -> None:
     assert named_targets(data) == {BMS}
 
 

@@ -76,7 +76,7 @@ def test_other_bytes_for_the_same_address_are_refused_by_address_and_place() -> 
     assert "place of 0xb" in message
 
 
-def test_only_the_window_is_kept_and_it_says_where_the_image_starts() -> None:
+def test_only_the_window_is_kept_and_it_states_where_the_image_starts() -> None:
     result = sparse((0, b"abcdef"), (20, b"z"), window=(2, 5))
     assert result.join(0) == (b"cde", 2)
     later = sparse((4, b"ef"), window=(2, 10))
@@ -92,7 +92,7 @@ def test_the_start_of_the_window_counts_as_the_start_of_a_gap() -> None:
         sparse((4, b"ef"), window=(2, 10)).join(1)
 
 
-def test_a_window_without_bytes_is_refused_and_told_where_the_bytes_are() -> None:
+def test_a_window_without_bytes_is_refused_and_the_message_names_where_the_bytes_are() -> None:
     with pytest.raises(ImageError) as caught:
         sparse((4, b"ef"), (8, b"g"), window=(0x10, 0x20)).join(0)
     message = str(caught.value)
@@ -130,7 +130,7 @@ PIECES = st.lists(st.tuples(st.integers(0, 60), st.binary(max_size=12)), max_siz
 
 
 @given(pieces=PIECES, window=st.none() | st.tuples(st.integers(0, 40), st.integers(41, 80)))
-def test_any_pieces_come_to_what_a_map_of_addresses_says(
+def test_any_pieces_come_to_the_same_as_a_map_of_addresses(
     pieces: list[tuple[int, bytes]], window: tuple[int, int] | None
 ) -> None:
     low, high = window or (0, 1000)

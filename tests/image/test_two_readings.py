@@ -210,7 +210,7 @@ PIECES = st.lists(st.tuples(st.integers(0, 60), st.binary(min_size=1, max_size=1
 
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(pieces=PIECES, suffix=st.sampled_from(sorted(LINES)))
-def test_any_records_come_to_what_a_map_of_addresses_says(
+def test_any_records_come_to_the_same_as_a_map_of_addresses(
     pieces: list[tuple[int, bytes]], suffix: str, tmp_path: Path
 ) -> None:
     path = written(tmp_path, suffix, [(0, b"first"), *pieces])

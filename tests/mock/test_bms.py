@@ -279,7 +279,7 @@ def memory(talk: Talk, start: int, end: int) -> list[Answer]:
 
 
 @each("start, size", [(0, 128), (0, 1), (5, 20), (300, 128), (400, 100)])
-def test_memory_reads_give_the_application_as_it_stands_in_the_flash(start: int, size: int) -> None:
+def test_memory_reads_give_the_application_of_the_flash(start: int, size: int) -> None:
     """R5."""
     talk = battery()
     assert isinstance(talk.engine, MockDevice)

@@ -45,7 +45,7 @@ def application_of(talk: Talk) -> BmsApplication:
 # -- faults ---------------------------------------------------------------------------------------
 
 
-def test_faults_are_told_every_200_ms_while_any_is_set() -> None:
+def test_faults_are_reported_every_200_ms_while_any_is_set() -> None:
     talk = battery()
     talk.run(1.0)
     assert talk.take() == []
@@ -89,7 +89,7 @@ def test_other_faults_do_not_change_the_cadence() -> None:
     assert [one.data[0] for one in heard] == [1, 1, 2, 2, 2]
 
 
-def test_the_bootloader_tells_no_faults() -> None:
+def test_the_bootloader_reports_no_faults() -> None:
     talk = battery(faults=1)
     talk.put(0x752, WRITE, 0x4205, b"RESET")
     talk.run(0.3)
@@ -114,7 +114,9 @@ def test_more_faults_than_there_are_bits_are_refused() -> None:
 # -- shutdown -------------------------------------------------------------------------------------
 
 
-def test_shutdown_is_repeated_every_200_ms_until_1_s_when_nobody_answers_then_it_is_off() -> None:
+def test_shutdown_is_repeated_every_200_ms_until_1_s_when_no_device_answers_then_it_is_off() -> (
+    None
+):
     talk = battery()
     device_of(talk).hold_key(talk.now)
     talk.run(0.99)
@@ -141,7 +143,7 @@ def test_shutdown_is_repeated_every_200_ms_until_1_s_when_nobody_answers_then_it
         ("motinova", [WMC_READY, OBC_READY, HMI_READY]),
     ],
 )
-def test_shutdown_is_said_once_when_all_others_are_ready_at_once_and_off_still_comes_after_1_s(
+def test_shutdown_is_sent_once_when_all_others_are_ready_at_once_and_off_still_comes_after_1_s(
     dialect: str, answers: list[tuple[int, int, int, bytes]]
 ) -> None:
     talk = battery(dialect=dialect)
@@ -301,7 +303,7 @@ def test_the_current_has_to_be_small_for_the_whole_half_hour() -> None:
     assert first_s - large_until_s == pytest.approx(1800.0, abs=1.5)
 
 
-def test_a_battery_that_tells_its_faults_keeps_the_bus_busy() -> None:
+def test_a_battery_that_reports_its_faults_keeps_the_bus_busy() -> None:
     talk = battery(idle_shutdown="on", faults=1)
     talk.run(2000.0)
     assert not talk.times_of(*SHUTDOWN)

@@ -102,7 +102,7 @@ def test_a_reset_during_the_announcements_may_restart_them_without_feedback() ->
     assert [type(row) for row in bench.take()] == 4 * [messages.BootVersion]
 
 
-def test_what_follows_a_reset_in_the_same_bytes_is_not_heard() -> None:
+def test_what_follows_a_reset_in_the_same_bytes_is_not_received() -> None:
     """A message that is found inside of a damaged one counts, and the device restarts on it."""
     bench = Bench()
     inner = bench.encoded(messages.ResetCommand()) + bench.encoded(READ_VERSION)
@@ -202,7 +202,7 @@ def test_the_update_command_is_taken_at_each_of_the_announcements(heard: int) ->
 
 @each("offset_s, taken", [(-0.001, True), (0.001, False)])
 @each("window_s", [0.0, 0.05, 1.0])
-def test_the_window_ends_when_the_profile_says(
+def test_the_window_ends_when_the_profile_states(
     offset_s: float, window_s: float, *, taken: bool
 ) -> None:
     """UP-04. The last announcement is 0.15 s after the first."""
@@ -344,7 +344,7 @@ def damaged_wires(packet: Packet) -> dict[str, bytes]:
     "choice, answer",
     [("nak_expected", [Nak(3)]), ("nak_received", [Nak(3)]), ("silence", [])],
 )
-def test_a_damaged_packet_is_answered_as_the_profile_says_and_taken_when_sent_again(
+def test_a_damaged_packet_is_answered_as_the_profile_states_and_taken_when_sent_again(
     choice: str, answer: list[Nak], kind: str
 ) -> None:
     """TX-01."""
@@ -368,7 +368,7 @@ def test_a_lost_frame_is_answered_by_nak_once_the_rest_does_not_come(lost: int) 
     finish(bench, PACKETS[2:], IMAGE)
 
 
-def test_without_its_first_frame_nothing_tells_that_it_was_a_packet() -> None:
+def test_without_its_first_frame_nothing_shows_that_it_was_a_packet() -> None:
     """TX-01: silence where it cannot tell."""
     bench = bench_in_transfer()
     bench.put_wire(bench.encoded(PACKETS[0])[8:])
@@ -411,7 +411,7 @@ def test_damage_that_does_not_begin_like_a_packet_is_not_answered() -> None:
 
 
 @each("choice, answer", [("ack", Ack(2)), ("nak_next", Nak(3))])
-def test_a_repeated_packet_is_answered_as_the_profile_says_and_nothing_is_written_twice(
+def test_a_repeated_packet_is_answered_as_the_profile_states_and_nothing_is_written_twice(
     choice: str, answer: messages.UpgradeMessage
 ) -> None:
     """TX-02, R10."""
@@ -453,7 +453,7 @@ def test_a_packet_after_the_last_one_is_rejected() -> None:
 
 
 @each("choice, answer", [("ack", [Ack(1)]), ("nak", [Nak(4)]), ("silence", [])])
-def test_an_older_packet_is_answered_as_the_profile_says(
+def test_an_older_packet_is_answered_as_the_profile_states(
     choice: str, answer: list[messages.UpgradeMessage]
 ) -> None:
     """TX-03."""
@@ -623,7 +623,9 @@ def test_an_early_end_is_answered_by_nak_with_the_packet_wanted_and_the_transfer
 
 
 @each("choice, answer", [("same_answer", [Complete()]), ("silence", [])])
-def test_a_second_end_is_answered_as_the_profile_says(choice: str, answer: list[Complete]) -> None:
+def test_a_second_end_is_answered_as_the_profile_states(
+    choice: str, answer: list[Complete]
+) -> None:
     """EN-02."""
     bench = bench_in_transfer(profile_with(repeated_end=choice), stored=5)
     bench.end()
@@ -819,7 +821,7 @@ def test_cancelled_it_finishes_the_message_under_way_and_is_done() -> None:
     assert device.deadline() is None
 
 
-def test_cancelled_it_hears_and_does_nothing_any_more() -> None:
+def test_cancelled_it_receives_and_does_nothing_any_more() -> None:
     bench = Bench(has_application=False)
     bench.run(0.01)
     bench.take()

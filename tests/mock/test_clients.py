@@ -166,7 +166,7 @@ def test_a_bus_that_takes_nothing_gets_one_copy_once_it_does() -> None:
         (Node.HMI, MOTINOVA, [(0x740, REPORT, 0x1305, b"READY")]),
     ],
 )
-def test_shutdown_is_answered_with_ready_and_the_wmc_says_goodbye_in_the_older_dialect(
+def test_shutdown_is_answered_with_ready_and_the_wmc_sends_goodbye_in_the_older_dialect(
     which: Node, dialect: Dialect, said: list[tuple[int, int, int, bytes]]
 ) -> None:
     talk = node(which, dialect)

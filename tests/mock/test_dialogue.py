@@ -124,14 +124,14 @@ def test_flash_times_delay_request_ack_and_complete_by_their_operations() -> Non
     assert (bench.device.erase_count, bench.device.program_count) == (3, 4)
 
 
-def test_the_whole_area_is_erased_when_the_profile_says_so() -> None:
+def test_the_whole_area_is_erased_when_the_profile_sets_it() -> None:
     profile = dataclasses.replace(QUICK, application_area_bytes=8192, erased_pages="all")
     bench = Bench(profile)
     bench.upgrade(image_of(100))
     assert bench.device.erase_count == 1 + 4
 
 
-def test_events_tell_the_story_of_an_upgrade() -> None:
+def test_events_report_the_story_of_an_upgrade() -> None:
     image = image_of(300)
     bench = Bench(BOOT_1_2_3)
     bench.upgrade(image)
@@ -202,7 +202,7 @@ def test_a_new_application_reports_the_version_that_its_image_holds(
     assert row.message.data[48:] == field
 
 
-def test_nobody_answers_the_version_query_in_the_bootloader() -> None:
+def test_no_device_answers_the_version_query_in_the_bootloader() -> None:
     bench = Bench(has_application=False)
     bench.send(READ_VERSION)
     assert bench.take() == []

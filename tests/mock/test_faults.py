@@ -71,7 +71,7 @@ def test_flash_operations_can_be_followed_from_outside() -> None:
     assert device.operations_done == ERASES + 1
 
 
-def test_an_operation_under_way_tells_when_it_is_half_done() -> None:
+def test_an_operation_under_way_reports_when_it_is_half_done() -> None:
     tool = Tool(make_device())
     tool.boot()
     tool.update(600)
@@ -187,7 +187,7 @@ def test_power_comes_back_after_its_time_and_the_device_announces_itself() -> No
 # -- bus-off --------------------------------------------------------------------------------------
 
 
-def test_off_the_bus_nothing_is_heard_and_nothing_is_said() -> None:
+def test_off_the_bus_nothing_is_received_and_nothing_is_reported() -> None:
     device = make_device()
     talk = Talk(device)
     device.bus_off(talk.now, 0.5)
@@ -202,7 +202,7 @@ def test_off_the_bus_nothing_is_heard_and_nothing_is_said() -> None:
     assert talk.ask(0x752, READ, 0x3300) != []
 
 
-def test_what_was_half_said_is_lost_and_what_the_device_does_meanwhile_goes_on() -> None:
+def test_what_was_half_sent_is_lost_and_what_the_device_does_meanwhile_goes_on() -> None:
     tool = Tool(make_device())
     tool.boot()
     device = tool.device

@@ -167,7 +167,7 @@ def test_new_operations_wait_for_the_one_under_way_and_replace_the_waiting_ones(
 
 
 @each("cut_at_s, erased_bytes", [(10.0, 0), (10.25, 8), (10.75, 24), (11.0, 32), (99.0, 32)])
-def test_an_aborted_erase_is_as_torn_as_its_time_says(cut_at_s: float, erased_bytes: int) -> None:
+def test_an_aborted_erase_is_as_torn_as_its_time(cut_at_s: float, erased_bytes: int) -> None:
     flash = make_flash()
     flash.program(START, b"\x00" * PAGE)
     controller = make_controller(flash)
@@ -178,7 +178,7 @@ def test_an_aborted_erase_is_as_torn_as_its_time_says(cut_at_s: float, erased_by
     assert controller.ends_at == inf
 
 
-def test_an_aborted_program_is_torn_and_the_operations_behind_it_are_forgotten() -> None:
+def test_an_aborted_program_is_torn_and_the_operations_after_it_are_forgotten() -> None:
     flash = make_flash()
     controller = make_controller(flash)
     controller.run(

@@ -202,7 +202,7 @@ def test_what_was_being_sent_or_received_is_gone_with_the_power() -> None:
     assert device.deadline() is None
 
 
-def test_without_power_nothing_is_heard_and_nothing_is_said() -> None:
+def test_without_power_nothing_is_received_and_nothing_is_reported() -> None:
     bench = Bench(SMALL)
     bench.device.power_cut(bench.now)
     bench.device.power_cut(bench.now)

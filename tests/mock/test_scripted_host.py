@@ -100,7 +100,7 @@ def test_a_host_that_strays_ends_with_the_right_image(script: HostScript) -> Non
         ),
     ],
 )
-def test_what_is_said_out_of_turn_is_answered_as_the_profile_says(
+def test_what_is_sent_out_of_turn_is_answered_as_the_profile_states(
     script: HostScript, choice: str, answers: list[tuple[str, int]]
 ) -> None:
     host, device = upgrade(script, profile=set_option(DeviceProfile(), *choice.split("=")))

@@ -161,7 +161,7 @@ def test_each_device_is_upgraded_while_the_others_talk(target: Target) -> None:
     assert talk[0x712, 0x3009] == (1 if target is WMC else 0)
 
 
-def test_a_bms_that_is_being_upgraded_answers_nobody_and_afterwards_all() -> None:
+def test_a_bms_that_is_being_upgraded_answers_no_query_and_afterwards_all() -> None:
     street = Street(WELLING, profile=DeviceProfile(pause_in_transfer="waits"))
     street.listen(2.05)
     street.say(0x4205, b"RESET")
@@ -183,7 +183,7 @@ def test_a_bms_that_is_being_upgraded_answers_nobody_and_afterwards_all() -> Non
     assert street.ear.counts[0x720, 0x1010] == street.ear.counts[0x732, 0x5000] == 10
 
 
-def test_only_the_target_s_events_are_told() -> None:
+def test_only_the_target_s_events_are_reported() -> None:
     street = Street(WELLING, WMC)
     street.listen(1.0)
     states = [event for event in street.events if isinstance(event, DeviceStateEntered)]
@@ -248,7 +248,7 @@ def test_frames_of_the_members_take_turns_and_each_message_stays_in_order() -> N
     assert system.deadline() is not None
 
 
-def test_a_frame_that_nobody_gave_out_is_not_missed() -> None:
+def test_a_frame_that_no_one_gave_out_is_not_missed() -> None:
     system = System(WELLING)
     system.frame_sent(1000.0)
     system.power_cut(1000.0)
@@ -257,7 +257,7 @@ def test_a_frame_that_nobody_gave_out_is_not_missed() -> None:
     assert not system.done
 
 
-def test_power_that_is_on_already_restarts_nobody() -> None:
+def test_power_that_is_on_already_restarts_no_device() -> None:
     street = Street(WELLING)
     street.listen(3.0)
     street.ear.counts.clear()

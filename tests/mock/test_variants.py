@@ -836,7 +836,7 @@ def test_an_unknown_variant_is_wrong_usage_that_names_the_one_meant() -> None:
     assert "no-crc-check" in caught.value.remedy
 
 
-def test_what_hangs_says_nothing_until_its_power_is_cut() -> None:
+def test_what_hangs_sends_nothing_until_its_power_is_cut() -> None:
     device = make_wrong("reset-in-transfer-hangs")
     assert isinstance(device, HangingDevice)
     tool = Tool(device)

@@ -66,13 +66,13 @@ def test_lost_versions_are_just_these() -> None:
     assert host.times("version") == pytest.approx([0.083, 0.183], abs=0.005)
 
 
-def test_a_version_that_changes_within_a_burst_is_heard_as_another_one() -> None:
+def test_a_version_that_changes_within_a_burst_counts_as_another_one() -> None:
     host, device = upgrade(DeviceScript(version_changes=True), HostScript(update_on_version=2))
     assert_upgraded(host, device)
     assert len(device.times("version", "said")) == 2
 
 
-def test_acks_are_dropped_doubled_and_late_where_told() -> None:
+def test_acks_are_dropped_doubled_and_late_where_set() -> None:
     host, device = upgrade(
         DeviceScript(
             drop_ack=frozenset({2}),
@@ -110,7 +110,7 @@ def test_a_device_that_restarts_has_no_application_and_announces_for_ever() -> N
     assert not device.completed
 
 
-def test_request_in_the_midst_is_said_once_and_nothing_is_stored_twice() -> None:
+def test_request_in_the_midst_is_reported_once_and_nothing_is_stored_twice() -> None:
     host, device = upgrade(DeviceScript(request_at=4))
     assert_upgraded(host, device)
     assert len(host.times("request")) == 2
@@ -123,7 +123,7 @@ def test_a_lost_final_answer_is_given_again_while_the_bootloader_is_there() -> N
     assert len(device.times("end")) == 2
 
 
-def test_announcements_after_the_final_answer_come_as_often_as_told() -> None:
+def test_announcements_after_the_final_answer_come_as_often_as_set() -> None:
     host, device = upgrade(DeviceScript(lose_complete=9, announce_after_complete=6))
     assert host.outcome == "no complete"
     assert len(host.times("version")) == 1 + 6

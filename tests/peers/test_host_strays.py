@@ -38,7 +38,7 @@ from .wording import WORDINGS, Frame, literal
         HostScript(end_twice=True),
     ],
 )
-def test_a_device_ends_with_the_right_image_whatever_the_host_said_in_between(
+def test_a_device_ends_with_the_right_image_whatever_the_host_sent_in_between(
     script: HostScript,
 ) -> None:
     host, device = upgrade(host=script)

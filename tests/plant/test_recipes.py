@@ -109,7 +109,7 @@ def test_the_newest_publication_for_a_socket_counts(centre: Centre) -> None:
     assert centre.given() == {third: ("A", "B")}
 
 
-def test_a_withdrawn_recipe_is_given_to_nobody_and_stays_where_it_is_in_use(
+def test_a_withdrawn_recipe_is_given_to_no_station_and_stays_where_it_is_in_use(
     centre: Centre,
 ) -> None:
     first, unused = centre.publish(REVISION_5), centre.publish(REVISION_5.replace('"5"', '"6"'))

@@ -159,7 +159,7 @@ def test_a_row_is_in_the_dialects_that_have_it(row: Row) -> None:
 
 
 @every_row
-def test_a_query_or_write_is_answered_as_the_documents_say(row: Row) -> None:
+def test_a_query_or_write_is_answered_as_the_documents_state(row: Row) -> None:
     answer = answer_of(BY_KEY[row.key])
     assert (answer.key if answer else ()) == row.answer
     assert (row.mode == P) == (answer is None)
@@ -186,7 +186,7 @@ def test_a_row_is_sent_by_and_to_nodes_that_its_dialects_have(item: Item) -> Non
         assert item.receiver is None or item.receiver in dialect.nodes
 
 
-def test_titles_tell_the_rows_of_one_sender_apart() -> None:
+def test_titles_distinguish_the_rows_of_one_sender() -> None:
     titles = [(item.can_id, item.title) for item in ITEMS]
     assert len(set(titles)) == len(titles)
 
@@ -459,7 +459,7 @@ def test_a_vector_is_decoded_and_encoded_to_its_wire_bytes(vector: Case) -> None
         ((0x725, 0x5503), contents.GeneralFeedback(), "bms general feedback ACK"),
     ],
 )
-def test_a_vector_says_what_its_name_says(
+def test_a_vector_is_what_its_name_states(
     key: tuple[int, int], content: Content, name: str
 ) -> None:
     vector = case(name)

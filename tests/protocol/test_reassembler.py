@@ -255,7 +255,7 @@ def test_frames_that_waited_while_the_computer_was_busy_are_not_late() -> None:
     assert list(reassembler.feed(_RESET.payloads[1], 60.0)) == [_RESET.message]
 
 
-def test_a_message_behind_a_partial_one_is_found_at_the_timeout() -> None:
+def test_a_message_after_a_partial_one_is_found_at_the_timeout() -> None:
     reassembler = make_reassembler(_ID)
     assert feed_all(reassembler, [*_PACKET.payloads[:3], *_RESET.payloads]) == []
     found = list(reassembler.tick(INTER_FRAME_TIMEOUT_S))

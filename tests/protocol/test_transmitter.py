@@ -74,7 +74,7 @@ def test_the_same_frame_is_given_until_it_was_sent() -> None:
     assert [transmitter.next_frame(now) for now in (5.0, 6.0)] == [_FIRST[1]] * 2
 
 
-def test_it_tells_when_the_last_frame_of_a_message_was_accepted() -> None:
+def test_it_reports_when_the_last_frame_of_a_message_was_accepted() -> None:
     transmitter = Transmitter(_BITRATE_BPS)
     transmitter.queue(_FIRST)
     transmitter.queue(_THIRD)
@@ -150,7 +150,7 @@ def test_the_time_of_a_later_message_does_not_hold_up_the_one_before() -> None:
     assert _send_all(transmitter, 2.0) == _SECOND
 
 
-def test_the_time_of_an_earlier_message_does_not_hold_up_the_one_behind() -> None:
+def test_the_time_of_an_earlier_message_does_not_hold_up_the_one_after() -> None:
     transmitter = Transmitter(_BITRATE_BPS)
     transmitter.queue(_FIRST, not_before=2.0)
     assert _send_all(transmitter, 2.0) == _FIRST

@@ -43,7 +43,7 @@ def test_nothing_is_split_into_no_frames() -> None:
     assert split(0x752, b"") == []
 
 
-def test_a_frame_is_a_standard_data_frame_unless_told_otherwise() -> None:
+def test_a_frame_is_a_standard_data_frame_unless_set_otherwise() -> None:
     assert Frame(0x751, b"\x55") == (0x751, b"\x55", False, False, False, False)
 
 

@@ -507,7 +507,7 @@ def test_a_checkpoint_of_other_entries_is_refused(case: Case) -> None:
 # -- honest and odd -------------------------------------------------------------------------------
 
 
-def test_a_name_says_nothing(case: Case) -> None:
+def test_a_name_alone_proves_nothing(case: Case) -> None:
     raw = case.maker.release()
     for name in ("bike", "bike.hex", "bike of Grün & Söhne (2).WFW", "bike.zip"):
         assert case.code(raw, name) is None
@@ -558,7 +558,7 @@ def test_a_release_needs_no_trust_file_and_no_log_inside(case: Case) -> None:
     assert case.code(case.maker.release(has_trust=False)) is None
 
 
-def test_a_log_that_nobody_asks_for_does_no_harm_and_is_not_remembered(case: Case) -> None:
+def test_a_log_that_no_one_asks_for_does_no_harm_and_is_not_remembered(case: Case) -> None:
     for _ in range(2):
         maker = replace(case.maker, log=ReleaseLog(), log_signers=("a stranger",))
         assert case.code(maker.release()) is None

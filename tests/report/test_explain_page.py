@@ -96,7 +96,7 @@ def test_packets_with_trouble_are_listed_with_their_copies() -> None:
     assert " 42 1 " not in rows
 
 
-def test_a_trace_without_an_upgrade_says_so_and_shows_who_talked() -> None:
+def test_a_trace_without_an_upgrade_is_reported_as_such_with_its_senders() -> None:
     page = Page(render(EVERY_KIND["no upgrade"]))
     assert "This trace holds no upgrade." in page.text
     assert "handshake" in page.text
@@ -122,7 +122,7 @@ def test_the_wall_time_is_shown_in_utc_and_nonsense_is_left_out() -> None:
         assert "UTC" not in Page(render(replace(good, started_at=nonsense))).text
 
 
-def test_what_the_recording_tool_said_is_shown() -> None:
+def test_what_the_recording_tool_noted_is_shown() -> None:
     said = Recorded("flasher flash bms.hex -t bms", 7, "a packet was not acknowledged\n  where: x")
     page = Page(render(replace(EVERY_KIND["troubled"], recorded=said)))
     assert "exit code 7" in page.text

@@ -56,7 +56,7 @@ def test_a_single_value_has_an_axis_too() -> None:
     assert ticks[0] <= 5 < ticks[-1]
 
 
-def test_values_that_no_tick_could_tell_apart_are_one_value() -> None:
+def test_values_that_no_tick_could_distinguish_are_one_value() -> None:
     assert linear_ticks(1e7 - 1e-8, 1e7) == linear_ticks(1e7, 1e7)
     assert linear_ticks(0, 5e-324) == linear_ticks(5e-324, 5e-324) == linear_ticks(0, 0)
     assert not wants_log([5e-324, 1])
@@ -127,7 +127,7 @@ def test_a_linear_axis_begins_at_zero_on_request() -> None:
     assert Axis.over([0.0015, 0.002], 0, 100).low > 0
 
 
-def test_the_labels_of_an_axis_tell_neighbours_apart() -> None:
+def test_the_labels_of_an_axis_distinguish_neighbours() -> None:
     axis = Axis.over([0.00181, 0.00184], 0, 100)
     labels = [axis.duration_label(tick.value) for tick in axis.ticks]
     assert labels == ["1.81 ms", "1.82 ms", "1.83 ms", "1.84 ms"]

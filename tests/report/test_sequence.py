@@ -39,7 +39,7 @@ def test_a_broadcast_goes_to_everybody_else() -> None:
     assert drawn.rows[0].tips == (tool.x, motor.x)
 
 
-def test_nothing_said_is_no_diagram() -> None:
+def test_an_empty_dialogue_is_no_diagram() -> None:
     assert diagram([], ["CDL", "BMS"], WIDE) == []
 
 
@@ -83,12 +83,12 @@ def test_escaped_characters_count_with_the_length_that_they_are_shown_with() -> 
     assert max(map(len, row.lines)) < 130
 
 
-def test_a_long_pause_is_said_and_a_short_one_is_not() -> None:
+def test_a_long_pause_is_reported_and_a_short_one_is_not() -> None:
     drawn = only(diagram([arrow(0), arrow(0.9), arrow(4.4)], ["CDL", "BMS"], WIDE))
     assert [row.lines[0] for row in drawn.rows] == ["reset", "reset", "3.5 s later", "reset"]
 
 
-def test_a_pause_that_the_dialogue_names_itself_is_not_said_twice() -> None:
+def test_a_pause_that_the_dialogue_names_itself_is_not_reported_twice() -> None:
     gap = DiagramItem(4.0, "4 s of silence")
     drawn = only(diagram([arrow(0), gap, arrow(4)], ["CDL", "BMS"], WIDE))
     assert [row.lines[0] for row in drawn.rows] == ["reset", "4 s of silence", "reset"]
@@ -131,7 +131,7 @@ def test_a_long_dialogue_keeps_its_ends_and_what_is_around_troubles() -> None:
     assert titles[around - 4] == "477 steps not drawn"
 
 
-def test_what_is_left_out_of_a_dialogue_full_of_trouble_says_so() -> None:
+def test_what_is_left_out_of_a_dialogue_full_of_trouble_is_counted() -> None:
     items = [
         DiagramItem(number / 10, "NAK", "", "BMS", "CDL", is_trouble=True) for number in range(1000)
     ]

@@ -132,7 +132,7 @@ def test_the_oracle_finds_a_success_that_is_none(monkeypatch: pytest.MonkeyPatch
     assert "FALSE" in {each.kind for each in verdict.violations}
 
 
-def test_the_oracle_finds_a_twin_that_was_left_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_oracle_finds_a_twin_that_was_left(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(DuplicateDetector, "_set_evidence", lambda _duplicates, _what: None)
     twin = "independent erase=0.05 late=0.003 ; @packet3+0.02 power device=1 seconds=9"
     verdict = play(Plan.parse(f"job target=wmc packets=3 ; independent erase=0.05 ; {twin}"))

@@ -59,7 +59,7 @@ def test_a_right_bootloader_is_upgraded_and_a_line_replays_the_run() -> None:
 
 
 @pytest.mark.slow
-def test_a_bootloader_begins_as_the_plan_says() -> None:
+def test_a_bootloader_begins_as_in_the_plan() -> None:
     with bench_of(RIGHT) as bench:
         for device in (
             "application=none", "begins=boot", "drift=0.01", "version=V0r9r9_20200101"

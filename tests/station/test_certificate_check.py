@@ -207,7 +207,7 @@ def test_records_that_were_changed_prove_nothing(bench: Bench) -> None:
 
 
 @pytest.mark.slow
-def test_a_later_run_of_the_unit_is_told(bench: Bench) -> None:
+def test_a_later_run_of_the_unit_is_reported(bench: Bench) -> None:
     bench.make(RunState.FAIL)
     text = page(bench)
     bench.make()

@@ -143,7 +143,7 @@ def test_a_unit_that_is_pulled_in_an_unobserved_time_before_the_end_of_its_trans
     assert bool(run.continuity.unobserved) == (not confirms)
 
 
-def test_an_adapter_that_was_away_in_the_transfer_accuses_nobody(tmp_path: Path) -> None:
+def test_an_adapter_that_was_away_in_the_transfer_accuses_no_device(tmp_path: Path) -> None:
     run = in_transfer(tmp_path)
     run.go_to(3.22)
     run.continuity.was_away(2.0)
@@ -218,7 +218,7 @@ def test_what_announces_itself_in_a_silent_socket_came_after_the_run_began(tmp_p
     assert "was silent when the run began" in run.continuity.lost
 
 
-def test_a_silent_unit_may_answer_and_restart_when_it_is_told_to(tmp_path: Path) -> None:
+def test_a_silent_unit_may_answer_and_restart_when_it_is_commanded_to(tmp_path: Path) -> None:
     run = Watched(tmp_path, was_silent=True)
     run.identify()
     run.send(1.1, ResetCommand())

@@ -245,7 +245,7 @@ def test_a_unit_that_is_exchanged_at_once_or_much_later(tmp_path: Path, gap_s: f
 
 @pytest.mark.slow
 @pytest.mark.parametrize("note", BETWEEN, ids=" ".join)
-def test_a_unit_that_is_exchanged_while_nobody_listens(
+def test_a_unit_that_is_exchanged_while_no_one_listens(
     tmp_path: Path, note: tuple[str, ...]
 ) -> None:
     second = replace(NEW_UNIT, factory_version=BMS_VERSION)
@@ -443,7 +443,7 @@ def test_a_unit_that_comes_while_the_one_in_its_bootloader_is_erased(
     world.check_caught()
 
 
-def test_a_blank_unit_exactly_alike_at_the_very_moment_cannot_be_told_from_the_first(
+def test_a_blank_unit_exactly_alike_at_the_very_moment_cannot_be_distinguished_from_the_first(
     tmp_path: Path,
 ) -> None:
     """The limit that the documents name."""
@@ -466,7 +466,7 @@ def test_a_device_that_falls_silent_in_its_transfer_is_not_reset(tmp_path: Path)
 
 
 @pytest.mark.parametrize("tries", [1, 2])
-def test_a_unit_that_was_not_erased_says_who_it_is_and_may_be_tried_again(
+def test_a_unit_that_was_not_erased_states_who_it_is_and_may_be_tried_again(
     tmp_path: Path, tries: int
 ) -> None:
     """It did not receive the update command, and has started its application."""
@@ -574,7 +574,7 @@ def test_a_battery_that_bears_another_label_costs_nothing_but_its_own_flash(tmp_
 # -- what is recorded -----------------------------------------------------------------------------
 
 
-def test_the_record_of_a_unit_that_stayed_says_so(tmp_path: Path) -> None:
+def test_the_record_of_a_unit_that_stayed_states_it(tmp_path: Path) -> None:
     bench = UnitBench(tmp_path, TWO_TARGETS, targets=(BMS, WMC))
     result = bench.run()
     assert result.outcome is RunState.PASS, result
@@ -684,7 +684,7 @@ def without_application(**profile: object) -> MockDevice:
 @pytest.mark.slow
 @pytest.mark.parametrize("stall_s", [0.1, 0.14, 0.16, 0.2, 0.23, 0.24])
 @pytest.mark.parametrize("kind", [RunKind.PRODUCTION, RunKind.RECHECK])
-def test_a_computer_that_stands_still_for_a_moment_is_no_pause_of_a_bootloader(
+def test_a_computer_that_stalls_for_a_moment_is_no_pause_of_a_bootloader(
     tmp_path: Path, kind: RunKind, stall_s: float
 ) -> None:
     bench = UnitBench(tmp_path)
@@ -698,7 +698,7 @@ def test_a_computer_that_stands_still_for_a_moment_is_no_pause_of_a_bootloader(
 @pytest.mark.parametrize("stall_s", [0.4, 1.0, 10.0])
 @pytest.mark.parametrize("reset", ["ignored", "restarts"])
 @pytest.mark.parametrize("has_application", [True, False])
-def test_what_a_computer_that_stands_still_did_not_see_does_not_accuse_the_unit(
+def test_what_a_computer_that_stalls_did_not_see_does_not_accuse_the_unit(
     tmp_path: Path, *, has_application: bool, reset: str, stall_s: float
 ) -> None:
     """An application says who it is; a bootloader could be another one."""
@@ -720,7 +720,7 @@ def test_what_a_computer_that_stands_still_did_not_see_does_not_accuse_the_unit(
 @pytest.mark.slow
 @pytest.mark.parametrize("gap_s", [0.1, 0.3, 1.0])
 @pytest.mark.parametrize("note", BETWEEN[:3], ids=" ".join)
-def test_units_in_their_bootloaders_that_change_places_while_nobody_listens(
+def test_units_in_their_bootloaders_that_change_places_while_no_one_listens(
     tmp_path: Path, note: tuple[str, ...], gap_s: float
 ) -> None:
     """Nothing speaks for another one, but nobody has seen that it is the same."""
@@ -734,7 +734,7 @@ def test_units_in_their_bootloaders_that_change_places_while_nobody_listens(
     world.check_untouched()
 
 
-def test_a_unit_that_is_exchanged_after_the_reset_while_nobody_listens(tmp_path: Path) -> None:
+def test_a_unit_that_is_exchanged_after_the_reset_while_no_one_listens(tmp_path: Path) -> None:
     world = Exchange(tmp_path, gap_s=0.3)
     bench, stalls = world.bench, 0
 

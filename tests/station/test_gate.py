@@ -196,7 +196,7 @@ def test_hung_threads_do_not_grow_in_number() -> None:
     assert not world.taken()[0].doubt
 
 
-def test_what_nobody_waits_for_is_released_at_the_end() -> None:
+def test_what_no_one_waits_for_is_released_at_the_end() -> None:
     world = World()
     world.gate.ask(ORDER)
     world.gate.close()

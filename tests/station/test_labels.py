@@ -182,7 +182,7 @@ def test_the_time_limit_holds_for_a_printer_that_knows_none(bench: Bench) -> Non
     labels.close()
 
 
-def test_a_printer_that_fails_touches_no_verdict_and_is_said(bench: Bench) -> None:
+def test_a_printer_that_fails_touches_no_verdict_and_is_reported(bench: Bench) -> None:
     printer = Printer(bench, refuse)
     line = LineBench(bench, labels=printer.labels)
     line.make("A", SERIAL)
@@ -211,7 +211,7 @@ def test_what_is_not_printed_stays_on_the_page(tmp_path: Path, bench: Bench) -> 
     assert check.text == "not printed: W1, W2, W3 and 1 more"
 
 
-def test_a_template_that_fails_on_one_unit_is_said(bench: Bench) -> None:
+def test_a_template_that_fails_on_one_unit_is_reported(bench: Bench) -> None:
     labels = LabelPrinter(
         template(bench, "{% if serial == 'W2605003' %}{{ lot.x.y }}{% endif %}"),
         lambda *_: None,
@@ -328,7 +328,7 @@ def test_units_that_did_not_pass_last_and_no_products_get_none(bench: Bench) -> 
     finished(line)
 
 
-def test_without_a_printer_it_is_said(bench: Bench) -> None:
+def test_without_a_printer_it_is_reported(bench: Bench) -> None:
     line = LineBench(bench)
     line.make("A", SERIAL)
     line.scan(f"REPRINT {SERIAL}")
@@ -498,7 +498,7 @@ def test_the_station_file_names_template_and_printer(tmp_path: Path) -> None:
         ('printer = "file:x"\ntime_limit_s = 0', "seconds above 0"),
     ],
 )
-def test_what_is_wrong_with_a_printer_is_said(tmp_path: Path, more: str, why: str) -> None:
+def test_what_is_wrong_with_a_printer_is_reported(tmp_path: Path, more: str, why: str) -> None:
     path = tmp_path / "sockets.toml"
     path.write_text(f'[label]\ntemplate = "l.zpl"\n{more}\n{SOCKET}', "utf-8")
     with pytest.raises(UsageError) as refused:

@@ -43,7 +43,7 @@ def walks(
 
 
 @each("sockets", [("A",), ("A", "B", "C")])
-def test_no_label_runs_on_another_unit_and_nobody_is_stuck(sockets: tuple[str, ...]) -> None:
+def test_no_label_runs_on_another_unit_and_nothing_blocks(sockets: tuple[str, ...]) -> None:
     steps = sample(3_000, 10_000)
     seen = walks(sockets, steps)
     assert seen["run"] > steps / 10

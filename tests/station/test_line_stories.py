@@ -372,11 +372,11 @@ def told(text: str) -> Played:
 
 
 @pytest.mark.parametrize("name", STORIES)
-def test_no_label_ends_on_another_unit_and_nobody_is_stuck(name: str) -> None:
+def test_no_label_ends_on_another_unit_and_nothing_blocks(name: str) -> None:
     assert told(STORIES[name]).text == ""
 
 
-def test_units_that_nobody_exchanges_pass() -> None:
+def test_units_that_are_not_exchanged_pass() -> None:
     played = told(
         "line sockets=2 ; unit label=1 ; unit label=2 number=maker ; unit label=3 number=own ;"
         " person name=jo ; @3.0 put unit=1 socket=A ; @4.0 card by=jo unit=1 ;"
@@ -422,7 +422,7 @@ def test_who_cannot_be_asked_has_to_stay_from_its_first_update_command_on() -> N
 
 
 @pytest.mark.parametrize("again", ["", " @11.5 card by=al unit=2 ;"])
-def test_a_unit_that_nobody_could_ask_is_counted_by_how_it_was_exchanged(again: str) -> None:
+def test_a_unit_that_no_one_could_ask_is_counted_by_how_it_was_exchanged(again: str) -> None:
     """Also when somebody else scans the card that waits once more, at the same page."""
     played = told(
         "line sockets=1 recipe=wmc ; unit label=1 ; unit label=2 ; person name=jo ;"
@@ -562,7 +562,7 @@ def test_a_seed_takes_the_same_course_in_each_process_and_when_it_is_played() ->
     assert without_folders(again) == drawn[1]
 
 
-def test_nobody_puts_a_unit_where_another_one_is_awaited() -> None:
+def test_no_step_puts_a_unit_where_another_one_is_awaited() -> None:
     put = "@6.0 put unit=2 socket=A"
     text = (
         "line sockets=2 ; unit label=1 ; unit label=2 ; person name=jo ;"
@@ -675,7 +675,7 @@ UNDETECTABLE = {
 
 
 @pytest.mark.parametrize("name", UNDETECTABLE)
-def test_what_nobody_can_detect_is_counted_by_its_reason(name: str) -> None:
+def test_what_no_one_can_detect_is_counted_by_its_reason(name: str) -> None:
     reason, story = UNDETECTABLE[name]
     played = told(story)
     assert played.seen is not None

@@ -81,7 +81,7 @@ def refusal(line: LineBench) -> str:
 # -- who works here -------------------------------------------------------------------------------
 
 
-def test_a_badge_says_who_works_and_nothing_runs_before_it(line: LineBench) -> None:
+def test_a_badge_states_who_works_and_nothing_runs_before_it(line: LineBench) -> None:
     line.arrive("A")
     line.scan("SOCKET A")
     line.scan(SERIAL)
@@ -95,7 +95,7 @@ def test_a_badge_says_who_works_and_nothing_runs_before_it(line: LineBench) -> N
     assert data == {"before": "", "now": "Jo", "role": "operator", "by": "Jo"}
 
 
-def test_operator_is_refused_where_badges_say_it(line: LineBench) -> None:
+def test_operator_is_refused_where_badges_name_the_operator(line: LineBench) -> None:
     line.scan(OPERATOR)
     line.scan("OPERATOR Ann")
     assert refusal(line) == "BADGES"
@@ -116,7 +116,7 @@ def test_the_code_of_a_badge_is_in_no_event(line: LineBench) -> None:
     assert SUPERVISOR not in repr(audit(line))
 
 
-def test_without_a_table_the_station_says_so_once(bench: Bench) -> None:
+def test_without_a_table_the_station_reports_it_once(bench: Bench) -> None:
     line = LineBench(bench)
     board = Board()
     for event in line.events:
@@ -432,7 +432,7 @@ def test_a_supervisor_has_to_allow_virtual_units_among_real_ones(bench: Bench) -
     assert audit(line)[-1] == ("resume", {"code": "VIRTUAL_MIXED", "by": "Sue"})
 
 
-def test_records_of_one_kind_need_nobody_to_allow_it(bench: Bench) -> None:
+def test_records_of_one_kind_need_no_permission(bench: Bench) -> None:
     bench.make()
     assert LineBench(bench, mixes_virtual=True, crew=crew()).station.line.stopped is None
 
@@ -489,7 +489,7 @@ def test_a_table_is_read(bench: Bench) -> None:
         (USUAL, "", "person"),
     ],
 )
-def test_what_is_wrong_with_a_table_is_said(bench: Bench, old: str, new: str, why: str) -> None:
+def test_what_is_wrong_with_a_table_is_reported(bench: Bench, old: str, new: str, why: str) -> None:
     whole = USUAL if old in USUAL else USUAL.replace("PIN_HASH", pin_hash())
     assert old in whole
     with pytest.raises(UsageError) as refused:
@@ -499,7 +499,7 @@ def test_what_is_wrong_with_a_table_is_said(bench: Bench, old: str, new: str, wh
     assert "470815" not in said, "somebody wrote the PIN itself"
 
 
-def test_a_missing_table_is_said(bench: Bench) -> None:
+def test_a_missing_table_is_reported(bench: Bench) -> None:
     with pytest.raises(UsageError, match="badge"):
         load_badges(Path("nowhere.toml"), bench.recipe.recipe.serial_number)
 

@@ -241,7 +241,9 @@ def test_a_clock_beyond_the_limit_stops(bench: Bench, offset_s: float, word: str
 
 
 @pytest.mark.parametrize(("rule", "begins"), [("block", False), ("allow", True)])
-def test_the_recipe_says_what_an_unknown_clock_means(bench: Bench, rule: str, begins: bool) -> None:
+def test_the_recipe_decides_what_an_unknown_clock_means(
+    bench: Bench, rule: str, begins: bool
+) -> None:
     bench.use(USUAL + f'\n[plant]\nclock = "stop"\nclock_unknown = "{rule}"\n')
     plant = Plant(bench)
     plant.claims.clock_offset_s = lambda: None  # type: ignore[method-assign]

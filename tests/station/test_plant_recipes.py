@@ -154,7 +154,7 @@ def test_differences_are_shown_from_the_recipe_of_each_socket(plant: Plant) -> N
         (SUPERVISOR, "RECIPE {digest:.4}", "NO_SUCH_RECIPE"),
     ],
 )
-def test_nobody_else_approves_and_nothing_else_is_approved(
+def test_no_one_else_approves_and_nothing_else_is_approved(
     plant: Plant, badge: str, scan: str, code: str
 ) -> None:
     digest = plant.give(REVISION_5)
@@ -165,7 +165,7 @@ def test_nobody_else_approves_and_nothing_else_is_approved(
     assert plant.line.bench.store.read.noted("line-2", AuditEvent.RECIPE_APPROVED) == []
 
 
-def test_without_badges_nobody_approves(bench: Bench) -> None:
+def test_without_badges_no_one_approves(bench: Bench) -> None:
     line = LineBench(bench)
     line.scan("RECIPE 0123456789ab")
     assert line.last(ScanRefused).code == "NO_BADGES"

@@ -28,7 +28,7 @@ def presence(tmp_path: Path) -> Presence:
     return Presence([each.profile for each in bench.recipe.targets])
 
 
-def test_nothing_is_said_before_it_is_known(presence: Presence) -> None:
+def test_nothing_is_claimed_before_it_is_known(presence: Presence) -> None:
     assert presence.change(0.0) is None
     assert presence.change(1.9) is None
     change = presence.change(2.0)
@@ -85,7 +85,9 @@ def test_it_is_asked_in_its_time(presence: Presence) -> None:
     assert presence.probe(0.5) == first
 
 
-def test_after_a_time_in_which_nothing_could_be_heard_nothing_is_known(presence: Presence) -> None:
+def test_after_a_time_in_which_nothing_could_be_received_nothing_is_known(
+    presence: Presence,
+) -> None:
     presence(TRAFFIC, sent=False, now=1.0)
     presence.change(1.0)
     presence.begin()
@@ -102,7 +104,7 @@ def version_answer(serial: str) -> list[Frame]:
     return split(0x720, encode(Message(0x720, Mode.REPORT, 0x1540, content.data())))
 
 
-def test_a_version_answer_says_which_unit_it_is(presence: Presence) -> None:
+def test_a_version_answer_identifies_its_unit(presence: Presence) -> None:
     presence(TRAFFIC, sent=False, now=1.0)
     change = presence.change(1.0)
     assert change is not None
@@ -121,7 +123,7 @@ def test_a_version_answer_says_which_unit_it_is(presence: Presence) -> None:
     assert change.serial is None, "it may be another unit"
 
 
-def test_a_unit_that_cannot_be_asked_is_said_to_be_unseen(tmp_path: Path) -> None:
+def test_a_unit_that_cannot_be_asked_is_reported_to_be_unseen(tmp_path: Path) -> None:
     bench = UnitBench(tmp_path)
     profile = replace(bench.recipe.targets[0].profile, target=WMC, version_query=None)
     assert not Presence([profile]).sees_units
@@ -159,7 +161,7 @@ def test_an_announcement_of_a_unit_that_is_there_is_an_arrival(presence: Presenc
     )  # fmt: skip
 
 
-def test_what_was_said_before_a_power_up_is_not_of_this_unit(presence: Presence) -> None:
+def test_what_was_received_before_a_power_up_is_not_of_this_unit(presence: Presence) -> None:
     for frame in version_answer("W2605002"):
         presence(frame, sent=False, now=1.0)
     presence.change(1.0)
@@ -228,14 +230,14 @@ def test_a_pause_like_the_last_one_is_no_pace_after_a_longer_burst(presence: Pre
     assert announce(presence, 3.0) == [(True, True)]
 
 
-def test_time_in_which_nobody_listened_is_no_silence(presence: Presence) -> None:
+def test_time_in_which_no_one_listened_is_no_silence(presence: Presence) -> None:
     hear(presence, version_answer("W2605002"), 1.0)
     presence.miss(4.0, 6.9)
     assert presence.change(6.9) is None
     assert presence.change(7.0) is not None
 
 
-def test_time_in_which_nobody_listened_is_no_pause(presence: Presence) -> None:
+def test_time_in_which_no_one_listened_is_no_pause(presence: Presence) -> None:
     announce(presence, 1.0, 1.05)
     for watcher in presence.watchers:
         watcher.miss(2.0)
@@ -243,7 +245,7 @@ def test_time_in_which_nobody_listened_is_no_pause(presence: Presence) -> None:
     assert announce(presence, 3.6) == [(True, True)]
 
 
-def test_a_bootloader_that_nobody_listened_to_may_be_another_one(presence: Presence) -> None:
+def test_a_bootloader_that_no_one_listened_to_may_be_another_one(presence: Presence) -> None:
     announce(presence, 1.0, 1.05)
     presence.miss(0.2, 1.3)
     assert presence.change(1.3) is None, "nobody exchanges it so fast"

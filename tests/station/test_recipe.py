@@ -117,7 +117,7 @@ def test_what_is_wrong_with_a_recipe_is_named(tmp_path: Path, change: object, fi
     assert finding in said(tmp_path, change(USUAL))
 
 
-def test_all_findings_are_told_at_once(tmp_path: Path) -> None:
+def test_all_findings_are_reported_at_once(tmp_path: Path) -> None:
     text = said(tmp_path, "x = 1\ny = 2\n" + USUAL.replace('revision = "4"', ""))
     assert text.count("unknown key") == 2
     assert "has no revision" in text

@@ -200,7 +200,7 @@ def test_the_life_of_a_unit_is_a_document(plant: Bench) -> None:
     assert document["runs"][1]["writes"][0]["what"] == "flash"
 
 
-def test_a_certificate_tells_what_was_written_and_how_far_it_was_verified(plant: Bench) -> None:
+def test_a_certificate_reports_what_was_written_and_how_far_it_was_verified(plant: Bench) -> None:
     html = page(plant, SERIAL)
     run = plant.store.read.unit(SERIAL).runs[-1].run
     assert run.log_sha256
@@ -219,7 +219,7 @@ def test_a_certificate_tells_what_was_written_and_how_far_it_was_verified(plant:
     assert "Earlier runs" not in html
 
 
-def test_the_code_on_the_paper_says_record_and_signed_row(
+def test_the_code_on_the_paper_states_record_and_signed_row(
     plant: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     said: list[str] = []

@@ -117,7 +117,7 @@ def test_500_scans_of_two_scanners_at_full_speed(stack: ExitStack) -> None:
         each.unplug()
 
 
-def test_nobody_else_gets_its_keys(stack: ExitStack) -> None:
+def test_no_one_else_gets_its_keys(stack: ExitStack) -> None:
     plugged = Plugged("scanner")
     other = importlib.import_module("evdev").InputDevice(plugged.path)
     reading = Reading(stack, plugged.path, "A")

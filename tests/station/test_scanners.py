@@ -131,7 +131,7 @@ def test_what_is_too_long_is_damaged_and_ends(decoded: Decoded) -> None:
     assert (decoded.scans, decoded.damaged) == (["W2"], 1)
 
 
-def test_events_that_the_kernel_dropped_damage_one_scan_and_are_said(decoded: Decoded) -> None:
+def test_events_that_the_kernel_dropped_damage_one_scan_and_are_reported(decoded: Decoded) -> None:
     events = list(typed("W2605002"))
     decoded.feed(*events[:6], KeyEvent(0, SYN_DROPPED, 0), *events[20:])
     decoded.feed(*typed("W2605003"))
@@ -216,7 +216,7 @@ def test_a_scanner_is_taken_for_the_station_alone() -> None:
     desk.scanner.close()
 
 
-def test_a_scanner_that_is_missing_is_said_once_and_opened_when_it_comes() -> None:
+def test_a_scanner_that_is_missing_is_reported_once_and_opened_when_it_comes() -> None:
     desk = Desk()
     assert not desk.scanner.step(0.0)
     assert not desk.scanner.step(0.0)
@@ -230,7 +230,7 @@ def test_a_scanner_that_is_missing_is_said_once_and_opened_when_it_comes() -> No
     desk.scanner.close()
 
 
-def test_an_unplugged_scanner_is_said_and_its_half_scan_goes_nowhere() -> None:
+def test_an_unplugged_scanner_is_reported_and_its_half_scan_goes_nowhere() -> None:
     desk = Desk("A")
     device = desk.plug()
     device.type(*list(typed("W26"))[:-6])
@@ -363,7 +363,7 @@ SOCKETS = '[[socket]]\nname = "A"\nmock = {}\n'
         ),
     ],
 )
-def test_what_is_wrong_with_a_scanner_is_said(tmp_path: Path, text: str, why: str) -> None:
+def test_what_is_wrong_with_a_scanner_is_reported(tmp_path: Path, text: str, why: str) -> None:
     path = tmp_path / "sockets.toml"
     path.write_text(f"[[scanner]]\n{text}\n{SOCKETS}", "utf-8")
     with pytest.raises(UsageError) as refused:
@@ -412,7 +412,7 @@ def test_it_leaves_alone_what_waits_of_another_scanner(line: LineBench) -> None:
     assert runs == {"A": SERIAL, "B": OTHER}
 
 
-def test_it_says_where_a_label_goes_that_waited_for_its_card(bench: Bench) -> None:
+def test_it_states_where_a_label_goes_that_waited_for_its_card(bench: Bench) -> None:
     line = LineBench(bench, are_empty=False)
     line.arrive("A")
     line.arrive("B")

@@ -36,7 +36,7 @@ def test_every_method_has_a_known_answer() -> None:
 
 
 @each("method", CHECKS)
-def test_a_wrong_character_is_found_wherever_it_stands(method: str) -> None:
+def test_a_wrong_character_is_found_at_any_place(method: str) -> None:
     for text in STANDARD_EXAMPLES[method]:
         for place, char in enumerate(text):
             for other in "0123456789":

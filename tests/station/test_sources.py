@@ -229,7 +229,7 @@ def test_two_units_that_are_put_in_after_their_scans(recipe: LoadedRecipe) -> No
         assert sorted(floor.runs) == [("W1", "A"), ("W2", "B")], order
 
 
-def test_a_second_card_is_refused_and_says_what_waits(recipe: LoadedRecipe) -> None:
+def test_a_second_card_is_refused_and_the_message_names_what_waits(recipe: LoadedRecipe) -> None:
     floor = Floor(recipe)
     floor.put_all(*pair())
     floor.scan("SOCKET A")
@@ -428,7 +428,7 @@ def test_green_does_not_come_back_to_an_empty_socket(recipe: LoadedRecipe) -> No
 
 @each("outage_s", [0.1, 1.0, 2.9])
 @each("own", ["", "W1"])
-def test_green_outlives_an_outage_only_with_a_unit_that_says_who_it_is(
+def test_green_outlives_an_outage_only_with_a_unit_that_states_who_it_is(
     recipe: LoadedRecipe, own: str, outage_s: float
 ) -> None:
     """However short: another one may be there, whose announcement nobody heard."""
@@ -450,7 +450,7 @@ def test_green_outlives_an_outage_only_with_a_unit_that_says_who_it_is(
 
 @each("put_after_s", [0.1, 1.0, 1.9])
 @each("outcome", [RunState.ERROR, RunState.FAIL])
-def test_a_card_is_not_for_a_unit_that_comes_before_anything_was_heard(
+def test_a_card_is_not_for_a_unit_that_comes_before_anything_was_received(
     recipe: LoadedRecipe, outcome: RunState, put_after_s: float
 ) -> None:
     """The unit of the last run waits for packets, and says nothing."""
@@ -590,7 +590,7 @@ def exchange(floor: Floor, chance: random.Random, table: deque[Unit], name: str)
 
 
 @pytest.mark.slow
-def test_no_run_is_begun_on_another_unit_and_nobody_is_stuck(recipe: LoadedRecipe) -> None:
+def test_no_run_is_begun_on_another_unit_and_nothing_blocks(recipe: LoadedRecipe) -> None:
     runs = 0
     seeds = sample(8, 30)
     for seed in range(seeds):

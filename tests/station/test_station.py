@@ -131,7 +131,7 @@ def test_the_next_label_waits_until_the_finished_unit_is_out(line: LineBench) ->
     assert line.order("A").serial == OTHER
 
 
-def test_steps_are_told_when_they_are_saved(line: LineBench) -> None:
+def test_steps_are_reported_when_they_are_saved(line: LineBench) -> None:
     line.make("A", SERIAL)
     assert [step.step for step in line.of(StepEnded)] == ["flash"]
 
@@ -193,7 +193,7 @@ def test_silence_is_no_empty_socket(bench: Bench) -> None:
     assert line.of(RunStarted) == []
 
 
-def test_a_unit_that_says_its_own_number_needs_no_card(line: LineBench) -> None:
+def test_a_unit_that_states_its_own_number_needs_no_card(line: LineBench) -> None:
     line.arrive("A")
     line.arrive("B", OTHER)
     line.scan(OTHER)
@@ -274,7 +274,7 @@ def test_a_unit_that_came_unobserved_may_have_been_there_before_its_socket_was_n
     assert len(line.of(RunStarted)) == (not refusals)
 
 
-def test_who_does_not_say_who_it_is_needs_the_card_of_its_socket(line: LineBench) -> None:
+def test_a_unit_that_does_not_identify_itself_needs_the_card_of_its_socket(line: LineBench) -> None:
     line.scan(SERIAL)
     line.arrive("A", None)
     line.bench.clock.go_on(2.9)
@@ -470,7 +470,7 @@ def test_where_units_cannot_be_seen_the_scan_begins(bench: Bench) -> None:
         ("RESUME", "NOT_STOPPED"),
     ],
 )
-def test_a_wrong_scan_changes_nothing_and_says_what_to_do(
+def test_a_wrong_scan_changes_nothing_and_states_what_to_do(
     line: LineBench, text: str, code: str
 ) -> None:
     line.scan(text)
@@ -480,7 +480,7 @@ def test_a_wrong_scan_changes_nothing_and_says_what_to_do(
     assert {view.state for view in line.station.line.sockets.values()} == {SocketState.EMPTY}
 
 
-def test_a_label_behind_a_refused_socket_goes_to_no_other(line: LineBench) -> None:
+def test_a_label_for_a_refused_socket_goes_to_no_other(line: LineBench) -> None:
     line.scan(SERIAL)
     line.arrive("A")
     line.arrive("B")
@@ -689,7 +689,7 @@ def test_a_claim_that_cannot_be_saved_begins_nothing(line: LineBench, bench: Ben
     assert line.state("A") is SocketState.STOPPED
 
 
-def test_what_cannot_be_audited_stops_the_line_once_and_resume_says_the_truth(
+def test_what_cannot_be_audited_stops_the_line_once_and_resume_states_the_truth(
     line: LineBench, bench: Bench
 ) -> None:
     other = hold(bench)
@@ -861,7 +861,7 @@ def test_what_a_dead_station_left_is_found_at_the_start(bench: Bench) -> None:
     assert line.order("A").kind is RunKind.RECHECK
 
 
-def test_what_an_interrupted_run_flashed_and_read_back_is_told_to_the_next(bench: Bench) -> None:
+def test_what_an_interrupted_run_flashed_and_read_back_is_given_to_the_next(bench: Bench) -> None:
     run_id = bench.claim().run_id
     target = bench.recipe.targets[0]
     write = bench.store.intent(
@@ -991,7 +991,7 @@ def test_what_must_not_change_is_held_over_a_fail_but_not_for_a_reworked_unit(
     assert known == ({} if reason else {"bms model": "BM36"})
 
 
-def test_what_is_not_saved_is_said_in_one_line(line: LineBench, bench: Bench) -> None:
+def test_what_is_not_saved_is_reported_in_one_line(line: LineBench, bench: Bench) -> None:
     line.scan(SERIAL)
     line.arrive("A")
     away = bench.path.with_name("away.sqlite")

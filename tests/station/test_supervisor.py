@@ -78,7 +78,7 @@ def test_a_power_cycle_is_off_a_pause_and_on() -> None:
     assert slept == [1.5]
 
 
-def test_a_power_command_that_fails_is_told_when_it_is_looked_at() -> None:
+def test_a_power_command_that_fails_is_reported_when_it_is_looked_at() -> None:
     power = PowerCommand("relay 3 {on|off}", run=FakeRelay("on"), sleep=lambda _s: None)
     power.begin_cycle()
     with pytest.raises(BusError, match="exit code 1"):

@@ -59,7 +59,7 @@ def test_a_good_unit_passes_through_every_step_in_order(tmp_path: Path) -> None:
     )
 
 
-def test_the_trace_of_a_good_unit_tells_all_of_it_and_its_restart_is_no_upgrade(
+def test_the_trace_of_a_good_unit_reports_all_of_it_and_its_restart_is_no_upgrade(
     tmp_path: Path,
 ) -> None:
     bench = UnitBench(tmp_path)
@@ -199,7 +199,7 @@ def test_a_unit_that_failed_after_its_flash_may_be_done_again(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(("low", "high", "code"), [(1000, 60000, "OK"), (1, 2, "LIMIT")])
-def test_a_measurement_is_held_against_its_limits(
+def test_a_measurement_is_compared_with_its_limits(
     tmp_path: Path, low: int, high: int, code: str
 ) -> None:
     bench = UnitBench(tmp_path, USUAL + WRITES + LIMIT.format(low=low, high=high))
@@ -258,7 +258,7 @@ def test_without_a_new_number_any_other_number_is_the_wrong_unit(tmp_path: Path)
     assert bench.run().code == "WRONG_UNIT"
 
 
-def test_a_unit_in_its_bootloader_says_its_number_before_anything_is_written(
+def test_a_unit_in_its_bootloader_states_its_number_before_anything_is_written(
     tmp_path: Path,
 ) -> None:
     profile = replace(NEW_UNIT, serial_number="W2605009")
@@ -341,7 +341,7 @@ def test_an_answer_that_is_compared_with_nothing_proves_nothing(tmp_path: Path) 
 # -- time, tries, people --------------------------------------------------------------------------
 
 
-def test_a_step_is_tried_as_often_as_the_recipe_says(tmp_path: Path) -> None:
+def test_a_step_is_tried_as_often_as_the_recipe_states(tmp_path: Path) -> None:
     bench = UnitBench(tmp_path, USUAL + WRITES + "\n[step.identify]\ntries = 3\npause_s = 2\n")
     bench.bus.detach(bench.units[BMS])
     began = bench.clock.now()
@@ -360,7 +360,7 @@ def test_a_step_that_takes_too_long_fails(tmp_path: Path) -> None:
     assert (duration.name, duration.high) == ("duration", 0.3)
 
 
-def test_a_person_stops_the_run_and_is_told_what_is_left(tmp_path: Path) -> None:
+def test_a_person_stops_the_run_and_learns_what_is_left(tmp_path: Path) -> None:
     bench = UnitBench(tmp_path)
     bench.is_cancelled = lambda: bench.device.program_count >= 1
     result = bench.run()
@@ -433,7 +433,7 @@ def test_a_silent_unit_without_application_is_flashed_only_with_the_card_of_its_
 # -- codes ----------------------------------------------------------------------------------------
 
 
-def test_every_code_tells_the_operator_one_thing_to_do() -> None:
+def test_every_code_gives_the_operator_one_thing_to_do() -> None:
     for code in CODES.values():
         assert code.action.endswith(".")
         assert code.meaning

@@ -92,7 +92,7 @@ def test_check_digits_are_kept(tmp_path: Path) -> None:
         rule.read(serial)
 
 
-def test_a_rule_without_room_says_so(tmp_path: Path) -> None:
+def test_a_rule_without_room_is_reported(tmp_path: Path) -> None:
     text = USUAL.replace("W(?P<year>[0-9]{2})(?P<week>[0-9]{2})(?P<number>[0-9]{3})", "W2605002")
     rule = make_recipe(tmp_path, text).recipe.serial_number
     with pytest.raises(UsageError, match="no serial numbers"):
@@ -199,7 +199,7 @@ def test_a_unit_keeps_what_is_in_it_wherever_it_is_put(tmp_path: Path) -> None:
     assert wrong.code == "WRONG_UNIT", "it bears the number that the first run wrote"
 
 
-def test_a_mislabelled_unit_says_another_number_than_its_paper(tmp_path: Path) -> None:
+def test_a_mislabelled_unit_reports_another_number_than_its_paper(tmp_path: Path) -> None:
     for text in (USUAL, USUAL + WRITES):
         recipe = make_recipe(tmp_path, text)
         socket = VirtualSocket(recipe, VirtualUnits(MockUnits(mislabelled=1.0), speed=0))

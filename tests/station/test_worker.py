@@ -255,7 +255,7 @@ class RealAdapter(Socket):
                 self.bus.unplug(back_after_s=2.5)
 
 
-def test_an_adapter_that_goes_is_told_once_and_opened_again(tmp_path: Path) -> None:
+def test_an_adapter_that_goes_is_reported_once_and_opened_again(tmp_path: Path) -> None:
     socket = RealAdapter(tmp_path)
     Worker(socket.setup, socket.recipe, socket.line, socket.connection()).work()
     assert socket.kinds == ["AdapterReady", "AdapterDown", "AdapterReady"]
@@ -263,7 +263,7 @@ def test_an_adapter_that_goes_is_told_once_and_opened_again(tmp_path: Path) -> N
     assert 2.5 <= socket.ready_at[-1] < 3.6
 
 
-def test_an_adapter_that_cannot_be_opened_is_told_once_and_tried_again(tmp_path: Path) -> None:
+def test_an_adapter_that_cannot_be_opened_is_reported_once_and_tried_again(tmp_path: Path) -> None:
     socket = RealAdapter(tmp_path)
     tries: list[float] = []
 
@@ -281,7 +281,7 @@ def test_an_adapter_that_cannot_be_opened_is_told_once_and_tried_again(tmp_path:
     )
 
 
-def test_a_socket_that_cannot_be_used_is_told_and_not_tried_again(tmp_path: Path) -> None:
+def test_a_socket_that_cannot_be_used_is_reported_and_not_tried_again(tmp_path: Path) -> None:
     socket = RealAdapter(tmp_path)
 
     def opened() -> NoReturn:

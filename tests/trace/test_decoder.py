@@ -145,7 +145,7 @@ def test_an_unknown_command_is_shown_with_its_bytes() -> None:
         (0x725, REPORT, 0xC402, b"\x00\x01", "data are 00 01, not 00 00"),
     ],
 )
-def test_a_message_that_breaks_its_row_says_how(
+def test_a_message_that_breaks_its_row_states_how(
     can_id: int, mode: int, command: int, data: bytes, problem: str
 ) -> None:
     seen = only(traffic.frames(can_id, mode, command, data))
@@ -173,7 +173,7 @@ def test_a_wrong_crc_is_damage_with_its_bytes() -> None:
     assert (seen.sender, seen.receiver, seen.is_trouble) == ("BMS", "all", True)
 
 
-def test_a_message_cut_short_is_told_when_its_time_is_over() -> None:
+def test_a_message_cut_short_is_reported_when_its_time_is_over() -> None:
     decoder = Decoder()
     assert list(decoder.feed(traffic.running()[0], 1.0)) == []
     assert decoder.deadline() == pytest.approx(1.1)

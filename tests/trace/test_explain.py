@@ -300,7 +300,7 @@ def test_the_table_holds_every_cause() -> None:
 
 
 @pytest.mark.parametrize("suffix", [".log", ".asc", ".blf", ".csv"])
-def test_every_format_tells_the_same(suffix: str, tmp_path: Path) -> None:
+def test_every_format_reports_the_same(suffix: str, tmp_path: Path) -> None:
     tape = refused(Tape().to_packet(7), 5)
     story = explain_path(tape.save(tmp_path / f"trace{suffix}"))
     assert (story.verdict.cause, story.verdict.packet) == (Cause.PACKET_REFUSED, 7)
@@ -351,7 +351,7 @@ def test_the_bytes_of_the_documents_are_understood(tmp_path: Path) -> None:
     assert upgrade.packets[0].answer_s == pytest.approx(0.125500 - 0.118500)
 
 
-def test_good_packets_are_one_line_and_the_bad_one_stands_out() -> None:
+def test_good_packets_are_one_line_and_the_bad_one_has_its_own() -> None:
     tape = Tape().to_packet(4).packet(4).nak(4).packet(4).ack(4).packets(5, 10).end().complete()
     (upgrade,) = told(tape).upgrades
     lines = upgrade.steps[5:-2]
@@ -379,7 +379,7 @@ def test_long_trouble_is_cut_in_the_middle_and_counted() -> None:
     assert upgrade.steps_left_out == 1400 + 6 - 1000
 
 
-def test_several_upgrades_and_targets_are_told_apart() -> None:
+def test_several_upgrades_and_targets_are_distinguished() -> None:
     tape = Tape("bms").to_end().nak(10).end().nak(10).wait(20)
     wmc = Tape("wmc")
     wmc.now, wmc.frames = tape.now, tape.frames
@@ -429,7 +429,7 @@ def test_announcements_just_before_the_update_command_belong_to_the_upgrade() ->
     assert upgrade.begin_s == pytest.approx(0.0)
 
 
-def test_a_bus_that_was_listened_to_longer_tells_more_than_its_last_frame() -> None:
+def test_a_bus_that_was_listened_to_longer_shows_more_than_its_last_frame() -> None:
     tape = Tape().to_packet(7)
     assert told(tape, until=tape.now + 5).verdict.cause is Cause.TOOL_STOPPED
 
@@ -475,7 +475,7 @@ def test_silence_and_error_frames_are_steps() -> None:
     assert (StepKind.GAP, "silence") in kinds
 
 
-def test_others_are_told_by_id_and_name() -> None:
+def test_others_are_reported_by_id_and_name() -> None:
     tape = Tape().to_end().complete().version(NEW)
     tape.frame(Frame(0x1FFFF, b"\x01", is_extended=True)).frame(Frame(0x123, b"\x01"))
     talkers = {talker.can_id: talker for talker in told(tape).talkers}

@@ -73,7 +73,7 @@ def test_a_capture_is_read_in_either_order_of_bytes(path: Path, order: str) -> N
         (struct.pack("<HHB3x", 9, 1, 6), 1_700_000_000_000_000, 1.7e9),
     ],
 )
-def test_times_are_read_as_the_interface_says(
+def test_times_are_read_as_the_interface_states(
     path: Path, options: bytes, units: int, at_s: float
 ) -> None:
     data = section() + interface(options=options) + packet(units=units)
@@ -146,7 +146,7 @@ WHOLE = section() + interface() + packet()
         (pcap("<", 0xA1B2C3D4)[:20], "does not begin as a capture"),
     ],
 )
-def test_what_cannot_be_read_is_told_in_words(path: Path, data: bytes, said: str) -> None:
+def test_what_cannot_be_read_is_reported_in_words(path: Path, data: bytes, said: str) -> None:
     path.write_bytes(data)
     with pytest.raises(UsageError) as caught:
         list(read_trace(path))
@@ -169,7 +169,7 @@ def test_a_right_capture_of_something_else_is_not_blamed_for_its_suffix(
     assert remedy in caught.value.remedy
 
 
-def test_what_stands_before_a_cut_is_read(path: Path) -> None:
+def test_what_comes_before_a_cut_is_read(path: Path) -> None:
     path.write_bytes(WHOLE + packet()[:-3])
     found: list[Frame] = []
     with pytest.raises(UsageError, match="is not a trace") as caught:

@@ -103,7 +103,7 @@ def test_a_missing_file_is_wrong_usage(tmp_path: Path) -> None:
         list(read_trace(tmp_path / "none.asc"))
 
 
-def test_an_unknown_suffix_is_told_with_the_known_ones(tmp_path: Path) -> None:
+def test_an_unknown_suffix_is_reported_with_the_known_ones(tmp_path: Path) -> None:
     path = tmp_path / "trace.xyz"
     path.write_bytes(b"x")
     with pytest.raises(UsageError, match="no trace format has this suffix") as caught:
@@ -237,7 +237,7 @@ def test_a_remote_frame_of_a_database_has_no_data_even_if_its_row_has(
     ]
 
 
-def test_a_format_whose_package_is_missing_is_told(
+def test_a_format_whose_package_is_missing_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("can.io.mf4.asammdf", None)

@@ -118,7 +118,7 @@ def test_a_database_holds_every_frame_and_none_of_the_recording_before(tmp_path:
         assert len(read(path)) == count
 
 
-def test_a_database_that_cannot_be_written_any_more_ends_the_recording_and_says_why(
+def test_a_database_that_cannot_be_written_any_more_ends_the_recording_and_states_why(
     tmp_path: Path,
 ) -> None:
     writer = writer_of(tmp_path / "trace.db")
@@ -206,7 +206,7 @@ def test_a_file_that_cannot_be_made_is_wrong_usage(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("error", [NotImplementedError, ImportError])
-def test_a_format_whose_package_is_missing_says_so(
+def test_a_format_whose_package_is_missing_names_the_package(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[Exception]
 ) -> None:
     """python-can's .mf4 needs a package of its own."""
@@ -235,7 +235,7 @@ class FullDisk:
         raise OSError(errno.ENOSPC, "No space left on device")
 
 
-def test_a_disk_that_fills_up_ends_the_recording_and_says_why(
+def test_a_disk_that_fills_up_ends_the_recording_and_states_why(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("flasher.trace.recorder.can.Logger", lambda _path: FullDisk(1))
@@ -245,7 +245,7 @@ def test_a_disk_that_fills_up_ends_the_recording_and_says_why(
     assert recorder.failure == "No space left on device"
 
 
-def test_a_recording_that_cannot_be_closed_says_so(
+def test_a_recording_that_cannot_be_closed_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("flasher.trace.recorder.can.Logger", lambda _path: FullDisk(100))

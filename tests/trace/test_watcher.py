@@ -75,12 +75,12 @@ def test_it_ends_after_its_time() -> None:
     assert watcher.done
 
 
-def test_raw_frames_come_before_what_they_say() -> None:
+def test_raw_frames_come_before_their_message() -> None:
     events = replayed(Watcher(raw=True), at(0.0, traffic.reset()))
     assert [type(event) for event in events] == [TimedFrame, TimedFrame, BusEvent]
 
 
-def test_a_message_that_a_trace_cuts_short_is_told_at_its_end() -> None:
+def test_a_message_that_a_trace_cuts_short_is_reported_at_its_end() -> None:
     events = replayed(Watcher(), at(5.0, traffic.running()[:2]))
     assert [event.kind for event in events if isinstance(event, BusEvent)] == [Kind.DAMAGED]
 

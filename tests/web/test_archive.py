@@ -45,7 +45,7 @@ def test_a_bundle_whose_report_is_damaged_is_listed_with_that(kept: Archive) -> 
     assert "is not the report of a bundle" in _asked(kept, "/kept").body.decode()
 
 
-def test_nothing_kept_yet_is_said(tmp_path: Path) -> None:
+def test_nothing_kept_yet_is_reported(tmp_path: Path) -> None:
     missing = tmp_path / "missing"
     assert _asked(Archive(missing, missing, missing), "/kept").status == 200
 

@@ -97,7 +97,7 @@ def test_an_upgrade_makes_three_claims_and_shows_before_and_after(place: BenchPl
     assert (_version(done, "before"), _version(done, "after")) == (OLD, NEW)
 
 
-def test_a_device_that_cannot_be_asked_is_not_said_to_run_anything(place: BenchPlace) -> None:
+def test_a_device_that_cannot_be_asked_is_not_reported_to_run_anything(place: BenchPlace) -> None:
     done = _done(place, target="wmc")
     assert (done.is_transferred, done.is_completed, done.is_running) == (True, True, None)
 
@@ -114,7 +114,7 @@ def test_it_is_kept_in_the_history_as_by_the_command(place: BenchPlace) -> None:
 
 
 @pytest.mark.slow
-def test_an_upgrade_that_the_history_cannot_take_says_so(
+def test_an_upgrade_that_the_history_cannot_take_is_reported(
     place: BenchPlace, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     assert _done(place).warning == ""
@@ -170,7 +170,7 @@ def test_the_next_bike_begins_with_nothing_of_the_last(place: BenchPlace) -> Non
 # -- images ----------------------------------------------------------------------------------------
 
 
-def test_only_images_that_fit_are_offered_and_the_others_say_why(place: BenchPlace) -> None:
+def test_only_images_that_fit_are_offered_and_the_others_state_why(place: BenchPlace) -> None:
     state = place.do(
         order(BenchController.use_adapter, BikeFault.NONE.value),
         order(BenchController.choose_target, "bms"),
@@ -292,7 +292,7 @@ def test_a_folder_that_may_not_be_listed_is_not_chosen(
 # -- checks that are waived ------------------------------------------------------------------------
 
 
-def test_a_check_that_refused_is_waived_for_this_image_and_stands_in_the_record(
+def test_a_check_that_refused_is_waived_for_this_image_and_is_in_the_record(
     place: BenchPlace, tmp_path: Path
 ) -> None:
     write_manifest(tmp_path / IMAGE, "V1r2r0_*")
@@ -385,7 +385,7 @@ def test_time_in_which_the_adapter_was_away_is_a_claim_of_its_own(
         (BikeFault.REFUSES, RefusedError, (True, False, None)),
     ],
 )
-def test_a_bad_end_says_what_happened_and_claims_no_more_than_is_known(
+def test_a_bad_end_states_what_happened_and_claims_no_more_than_is_known(
     place: BenchPlace, fault: BikeFault, error: type[Exception], claims: tuple[bool | None, ...]
 ) -> None:
     done = _done(place, fault)
@@ -412,7 +412,7 @@ def test_a_bootloader_that_announces_itself_instead_runs_no_new_version(place: B
         assert replace(done, result=result).is_running is is_running
 
 
-def test_a_bad_end_is_said_in_the_language_of_the_page(place: BenchPlace) -> None:
+def test_a_bad_end_is_reported_in_the_language_of_the_page(place: BenchPlace) -> None:
     error = _done(place, BikeFault.POWER).error
     assert error is not None
     assert "Rescue this device." in error.remedy
@@ -514,7 +514,7 @@ def test_a_bike_that_was_interrupted_before_is_rescued_from_the_start(place: Ben
     assert done.is_completed
 
 
-def test_a_bike_that_is_off_says_so(place: BenchPlace) -> None:
+def test_a_bike_that_is_off_is_reported_as_off(place: BenchPlace) -> None:
     assert isinstance(
         place.do(order(BenchController.use_adapter, BikeFault.OFF.value)).trouble, NoAnswerError
     )
@@ -532,7 +532,7 @@ def _at_packet(number: int, do: Callable[[], None]) -> Callable[[object], None]:
 
 
 @pytest.mark.parametrize("end", [BenchController.stop, BenchController.close])
-def test_who_stops_it_is_told_in_which_state_the_device_is_left(
+def test_who_stops_it_learns_in_which_state_the_device_is_left(
     place: BenchPlace, end: Callable[[BenchController], None]
 ) -> None:
     place.bikes.hold = _at_packet(7, lambda: end(place.bench))
@@ -578,7 +578,7 @@ def test_an_order_out_of_turn_is_refused_in_words(place: BenchPlace, ordered: Or
 # -- looking closer --------------------------------------------------------------------------------
 
 
-def test_what_is_said_on_the_bus_is_shown_until_it_is_stopped(
+def test_what_is_sent_on_the_bus_is_shown_until_it_is_stopped(
     place: BenchPlace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     place.do(order(BenchController.use_adapter, BikeFault.HARDWARE.value))
@@ -621,7 +621,7 @@ def test_the_bus_is_watched_in_the_time_of_its_messages(
     assert watched.since_s == pytest.approx(row.count / row.rate_hz, rel=0.1)
 
 
-def test_a_bus_that_fails_while_it_is_watched_says_so(
+def test_a_bus_that_fails_while_it_is_watched_is_reported(
     place: BenchPlace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     place.do(order(BenchController.use_adapter, BikeFault.NONE.value))
@@ -674,7 +674,7 @@ def test_the_addresses_of_a_backup_may_be_those_of_an_image(
     assert state.saved.area.source.endswith("running.hex")
 
 
-def test_a_backup_without_memory_says_what_is_not_in_it(place: BenchPlace) -> None:
+def test_a_backup_without_memory_states_what_is_not_in_it(place: BenchPlace) -> None:
     saved = place.do(
         order(BenchController.use_adapter, BikeFault.NONE.value), order(back_up, "")
     ).saved
@@ -696,7 +696,7 @@ def test_nothing_is_saved_of_a_battery_that_is_silent_or_where_nothing_can_be_wr
     assert state.saved is None
 
 
-def test_what_the_battery_told_is_said_in_the_words_of_the_command(place: BenchPlace) -> None:
+def test_what_the_battery_reported_is_shown_in_the_words_of_the_command(place: BenchPlace) -> None:
     state = place.do(order(BenchController.use_adapter, BikeFault.NONE.value))
     found = dict(battery_answers(state))
     assert found["faults"] == [("faults", "none received")]
@@ -742,7 +742,7 @@ def test_the_file_that_came_last_replaces_the_selected_image(place: BenchPlace) 
         ("broken.s19", b"S1"),
     ],
 )
-def test_a_file_that_is_refused_takes_the_selected_image_away_and_says_why(
+def test_a_file_that_is_refused_takes_the_selected_image_away_and_states_why(
     name: str, data: bytes, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     place = BenchPlace(tmp_path_factory.mktemp("place"))

@@ -112,7 +112,7 @@ def test_an_interrupted_upgrade_is_rescued(page: Page) -> None:
     assert _claims(page) == ["YES", "YES", "YES"]
 
 
-def test_files_that_do_not_fit_say_why_and_dropped_ones_are_looked_at(page: Page) -> None:
+def test_files_that_do_not_fit_state_why_and_dropped_ones_are_looked_at(page: Page) -> None:
     page.click("#adapter-1")
     page.click("#target-bms:enabled")
     expect(page.locator("#image-1")).to_be_visible()
@@ -126,7 +126,7 @@ def test_files_that_do_not_fit_say_why_and_dropped_ones_are_looked_at(page: Page
     expect(page.locator("#message")).to_contain_text("neither an image")
 
 
-def test_files_are_taken_before_anything_is_chosen_and_a_trace_tells_its_story(
+def test_files_are_taken_before_anything_is_chosen_and_a_trace_reports_its_story(
     page: Page, place: BenchPlace
 ) -> None:
     image = image_of(3, NEW).data
@@ -221,7 +221,7 @@ def test_a_check_is_waived_in_a_second_step_that_names_the_risk(page: Page) -> N
     expect(page.locator("#start")).to_contain_text("Waived for this upgrade")
 
 
-def test_the_page_says_when_its_program_has_ended(page: Page, place: BenchPlace) -> None:
+def test_the_page_states_when_its_program_has_ended(page: Page, place: BenchPlace) -> None:
     page.click(f"#adapter button:text-is('{BikeFault.NONE.value}')")
     expect(page.locator("#target-bms")).to_be_visible()
     place.bench.feed.close()
@@ -232,7 +232,7 @@ def test_the_page_says_when_its_program_has_ended(page: Page, place: BenchPlace)
     assert name == "none"
 
 
-def test_an_image_that_the_device_refuses_is_not_said_to_be_completed(page: Page) -> None:
+def test_an_image_that_the_device_refuses_is_not_reported_to_be_completed(page: Page) -> None:
     _choose(page, BikeFault.REFUSES)
     page.click("#go")
     assert _claims(page) == ["YES", "NO", "NOT KNOWN"]
@@ -284,7 +284,7 @@ def test_a_file_that_is_chosen_while_an_image_is_selected_is_the_one_to_be_flash
     expect(page.locator("#go")).to_have_count(0)
 
 
-def test_a_page_that_lost_its_server_in_an_upgrade_says_what_is_known_and_what_to_do(
+def test_a_page_that_lost_its_server_in_an_upgrade_states_what_is_known_and_what_to_do(
     tab: Tab, place: BenchPlace
 ) -> None:
     reached, go_on = threading.Event(), threading.Event()

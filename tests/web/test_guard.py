@@ -64,7 +64,7 @@ def test_a_page_of_this_server_may_post(client: TestClient) -> None:
         ({"host": "127.0.0.1.evil.example:8740"}, 421),
     ],
 )
-def test_nobody_else_may(client: TestClient, headers: dict[str, str], status: int) -> None:
+def test_no_one_else_may(client: TestClient, headers: dict[str, str], status: int) -> None:
     assert _post(client, **headers).status_code == status
 
 
@@ -82,7 +82,7 @@ def test_nothing_is_changed_by_get(client: TestClient) -> None:
     assert client.get("/do").status_code == 405
 
 
-def test_a_body_is_limited_whatever_its_header_says(client: TestClient) -> None:
+def test_a_body_is_limited_whatever_its_header_states(client: TestClient) -> None:
     token = client.get("/").text
     headers = {"origin": _URL, TOKEN_HEADER: token}
     large = b"x" * (BODY_MAX + 1)
@@ -142,7 +142,7 @@ def test_the_address_lets_one_browser_in_and_is_void_then() -> None:
 
 
 @pytest.mark.parametrize("key", ["", "?key=", "?key=guessed", "?key=%00"])
-def test_a_guessed_key_lets_nobody_in_and_does_not_void_the_address(key: str) -> None:
+def test_a_guessed_key_lets_no_one_in_and_does_not_void_the_address(key: str) -> None:
     entry = BrowserEntry(Pages())
     client = _client(entry=entry)
     assert client.get(f"/enter{key}").headers["location"] == "/closed"

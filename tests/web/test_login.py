@@ -531,7 +531,7 @@ def test_everywhere_is_all_of_one_person() -> None:
     assert (ended["address"], ended["by"]) == ("192.0.2.2", "Sue")
 
 
-def test_who_knows_the_password_signs_nobody_else_out() -> None:
+def test_who_knows_the_password_signs_no_one_else_out() -> None:
     place = Place(is_far=True, password=ALL)
     first, second = place.browser(), place.browser("192.0.2.2")
     sign_in(first, password=ALL)

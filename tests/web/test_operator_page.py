@@ -200,7 +200,7 @@ def test_no_scan_is_lost_or_split_while_tiles_change(page: Page, line: LineScree
     assert line.scans == scans
 
 
-def test_a_scan_that_did_not_reach_the_station_is_said_and_forgotten(
+def test_a_scan_that_did_not_reach_the_station_is_reported_and_forgotten(
     page: Page, line: LineScreen
 ) -> None:
     page.route("**/line/scan", lambda route: route.abort())
@@ -232,7 +232,7 @@ def test_a_scan_that_was_held_up_on_its_way_is_refused(
     tab.wrong.clear()
 
 
-def test_a_refused_scan_is_said(page: Page, line: LineScreen) -> None:
+def test_a_refused_scan_is_reported(page: Page, line: LineScreen) -> None:
     line.say(ScanRefused("X1", "WRONG_SERIAL", "No serial number.", "Scan the label.", at=AT))
     expect(page.locator("#spoken")).to_have_text("X1: No serial number. Scan the label.")
 
@@ -321,7 +321,7 @@ def _grey_shapes(page: Page, line: LineScreen) -> dict[SocketState, Image.Image]
     return shapes
 
 
-def test_states_are_told_apart_without_colour(page: Page, line: LineScreen) -> None:
+def test_states_are_distinguished_without_colour(page: Page, line: LineScreen) -> None:
     """By their shapes alone, in grey; the verdicts besides by their brightness to the others."""
     shapes = _grey_shapes(page, line)
     for one, other in itertools.combinations(shapes, 2):

@@ -37,7 +37,7 @@ def _broken(what: str) -> Answering:
     raise UsageError(what, remedy="Correct it.")
 
 
-def test_a_question_is_answered_and_what_is_wrong_is_said() -> None:
+def test_a_question_is_answered_and_what_is_wrong_is_reported() -> None:
     """A place that cannot be opened is an answer, and no process that dies again and again."""
     with (
         closing(QueryProcesses(_echo)) as answering,

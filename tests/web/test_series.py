@@ -215,7 +215,7 @@ def test_an_agreement_that_comes_late_is_not_for_the_next_unit(place: BenchPlace
 
 
 @each("target", ["wmc", "obc"])
-def test_devices_without_a_query_are_told_apart_by_the_battery(
+def test_devices_without_a_query_are_distinguished_by_the_battery(
     target: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     session = Session(

@@ -204,7 +204,9 @@ def test_the_form_of_the_runs_narrows_them_and_its_files_are_of_the_same(
     ],
 )
 @pytest.mark.parametrize("page", ["/runs", "/yield"])
-def test_a_form_that_cannot_be_says_so(client: TestClient, page: str, query: str) -> None:
+def test_a_form_that_cannot_be_is_refused_with_the_reason(
+    client: TestClient, page: str, query: str
+) -> None:
     answer = client.get(f"{page}?{query}")
     assert answer.status_code == 400
     assert 'role="alert"' in answer.text
@@ -258,7 +260,7 @@ def test_a_part_of_a_number_finds_its_runs(client: TestClient) -> None:
 
 
 @pytest.mark.parametrize("path", ["/runs/999", "/runs/999/trace", "/units/certificate?serial=W1"])
-def test_what_is_not_there_is_said(client: TestClient, path: str) -> None:
+def test_what_is_not_there_is_reported(client: TestClient, path: str) -> None:
     assert client.get(path).status_code == 404
 
 
@@ -497,7 +499,7 @@ def test_empty_records_have_pages_too(bench: Bench, path: str) -> None:
 
 
 @pytest.mark.slow
-def test_pages_change_nothing_and_wait_for_nobody(bench: Bench) -> None:
+def test_pages_change_nothing_and_wait_for_no_one(bench: Bench) -> None:
     bench.make()
     client = client_of(app_of(bench.path, bench.keys))
     with bench.outsider() as writer:
@@ -509,7 +511,7 @@ def test_pages_change_nothing_and_wait_for_nobody(bench: Bench) -> None:
         writer.execute("ROLLBACK")
 
 
-def test_damaged_records_are_said(bench: Bench) -> None:
+def test_damaged_records_are_reported(bench: Bench) -> None:
     bench.make()
     client = client_of(app_of(bench.path, bench.keys))
     bench.store.close()

@@ -38,7 +38,7 @@ def test_values_and_scans_stand_in_every_language(language: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_sentence_is_said_by_its_template() -> None:
+def test_a_sentence_is_translated_by_its_template() -> None:
     wanted = text("Put {label} into socket {socket}.", label="W1", socket="A")
     assert wanted == "Put W1 into socket A."
     assert translator("de")(wanted) == "W1 auf Platz A setzen."
@@ -52,7 +52,7 @@ def test_a_value_is_never_taken_for_a_template() -> None:
     assert translator("de")(said) == "{socket} %s {0} scannen."
 
 
-def test_a_value_is_exchanged_wherever_it_stands() -> None:
+def test_a_value_is_exchanged_at_any_place() -> None:
     inner = text("Put {label} into socket {socket}.", label=text("W1"), socket="A")
     both = text("{wanted} Or scan CANCEL.", wanted=inner)
     assert with_value(both, "W1", "W2") == "Put W2 into socket A. Or scan CANCEL."

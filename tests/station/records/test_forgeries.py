@@ -157,7 +157,7 @@ PLAIN = [
 
 
 @pytest.mark.parametrize(("statement", "where", "what"), PLAIN, ids=[row[0] for row in PLAIN])
-def test_a_changed_row_is_told(
+def test_a_changed_row_is_found(
     plant: Bench, tmp_path: Path, statement: str, where: str, what: str
 ) -> None:
     problems = examined(plant, tmp_path, lambda forger, _: forger(statement))
@@ -177,7 +177,7 @@ def to_pass(forger: Forger, folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_fail_that_became_a_pass_in_a_recomputed_chain_is_told(
+def test_a_fail_that_became_a_pass_in_a_recomputed_chain_is_reported(
     plant: Bench, tmp_path: Path
 ) -> None:
     def forge(forger: Forger, folder: Path) -> None:
@@ -191,7 +191,7 @@ def test_a_fail_that_became_a_pass_in_a_recomputed_chain_is_told(
     assert told(problems, "runs 2, 3", "the same trace")
 
 
-def test_a_chain_signed_anew_with_another_key_is_told_by_the_kept_heads(
+def test_a_chain_signed_anew_with_another_key_is_found_by_the_kept_heads(
     plant: Bench, tmp_path: Path
 ) -> None:
     def forge(forger: Forger, folder: Path) -> None:
@@ -209,7 +209,7 @@ def test_a_chain_signed_anew_with_another_key_is_told_by_the_kept_heads(
     assert "replaced" in problem.what
 
 
-def test_rules_taken_away_or_made_weaker_are_told(plant: Bench, tmp_path: Path) -> None:
+def test_rules_taken_away_or_made_weaker_are_reported(plant: Bench, tmp_path: Path) -> None:
     def forge(forger: Forger, _folder: Path) -> None:
         del forger.rules["run_delete"]
         forger.rules["pass_log"] = forger.rules["pass_log"].replace("NOT EXISTS", "EXISTS")
@@ -222,7 +222,7 @@ def test_rules_taken_away_or_made_weaker_are_told(plant: Bench, tmp_path: Path) 
     ]
 
 
-def test_an_older_copy_is_told(bench: Bench) -> None:
+def test_an_older_copy_is_reported(bench: Bench) -> None:
     bench.make()
     older = bench.folder / "older.sqlite"
     bench.store.backup(older)
@@ -236,7 +236,7 @@ def test_an_older_copy_is_told(bench: Bench) -> None:
 
 
 @pytest.mark.slow
-def test_a_pass_with_the_trace_of_something_else_is_told(bench: Bench) -> None:
+def test_a_pass_with_the_trace_of_something_else_is_reported(bench: Bench) -> None:
     """Written through the station's own operations, with its key: only the trace tells."""
     folder = bench.folder
     other_image = IMAGES[next(target for target in IMAGES if target.name == "wmc")]
@@ -274,7 +274,7 @@ def passed(bench: Bench, serial: str, trace: Path) -> RunId:
     return run_id
 
 
-def test_wholly_new_records_are_told_where_the_heads_have_to_be(
+def test_wholly_new_records_are_found_where_the_heads_have_to_be(
     plant: Bench, tmp_path: Path
 ) -> None:
     new = str(tmp_path / "new.sqlite")
@@ -291,7 +291,7 @@ def test_wholly_new_records_are_told_where_the_heads_have_to_be(
         assert told(store.examine().problems, "heads of line-2", "no head of these records")
 
 
-def test_kept_heads_that_were_changed_are_told(plant: Bench, tmp_path: Path) -> None:
+def test_kept_heads_that_were_changed_are_reported(plant: Bench, tmp_path: Path) -> None:
     def forge(_forger: Forger, folder: Path) -> None:
         (kept,) = (folder / "keys").glob("*.heads")
         lines = kept.read_text().splitlines(keepends=True)

@@ -149,7 +149,7 @@ def passed(bench: Bench, measured: Measurement | None = None, text: str = "") ->
     return bench.store.read.run(run_id)
 
 
-def test_records_of_such_a_run_are_told_by_name(bench: Bench) -> None:
+def test_records_of_such_a_run_are_reported_by_name(bench: Bench) -> None:
     run_id = passed(bench).run.run_id
     (problem,) = bench.store.examine().problems
     assert problem.where == f"run {run_id}, PASS of {SERIAL}"
@@ -197,7 +197,7 @@ def test_nothing_speaks_against_the_trace_of_a_unit_that_stayed(
         assert (heard.restarts.uncaused, heard.changes) == ([], [])
 
 
-def test_the_trace_of_a_unit_that_lost_its_supply_tells_it(tmp_path: Path) -> None:
+def test_the_trace_of_a_unit_that_lost_its_supply_shows_it(tmp_path: Path) -> None:
     bench = UnitBench(tmp_path, 'after_restart = "continue"\n' + USUAL + WRITES)
     was_lost = False
 

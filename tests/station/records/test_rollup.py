@@ -384,7 +384,7 @@ def test_sums_that_are_damaged_are_named_with_what_to_do(made: Lines, bench: Ben
     assert found.value.where == str(file)
 
 
-def test_sums_of_which_nobody_knows_the_end_are_made_anew(made: Lines, bench: Bench) -> None:
+def test_sums_of_which_no_one_knows_the_end_are_made_anew(made: Lines, bench: Bench) -> None:
     later = bench.clock.now + timedelta(days=2)
     add_up(made, later)
     file = bench.store.files.folder / "figures.sqlite"

@@ -149,7 +149,7 @@ def test_nothing_is_changed_while_another_station_of_the_records_runs(old: Old) 
     assert old.upgrade().after == NEWEST
 
 
-def test_a_rule_that_was_taken_away_before_is_told_and_stays_told(old: Old) -> None:
+def test_a_rule_that_was_taken_away_before_is_reported_and_stays_reported(old: Old) -> None:
     with old.engine.begin() as connection:
         connection.execute(text("DROP TRIGGER run_update"))
         connection.execute(text("CREATE INDEX foreign_one ON unit (part)"))

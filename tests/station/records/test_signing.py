@@ -145,7 +145,9 @@ def test_heads_that_begin_late_leave_the_rows_before_unchecked(bench: Bench) -> 
 
 
 @pytest.mark.slow
-def test_an_older_copy_does_not_become_the_station_before_a_person_says_so(bench: Bench) -> None:
+def test_an_older_copy_does_not_become_the_station_before_a_person_confirms_it(
+    bench: Bench,
+) -> None:
     bench.make()
     older = bench.folder / "older.sqlite"
     bench.store.backup(older)
@@ -184,7 +186,7 @@ def test_the_chains_of_two_stations_stand_for_themselves(bench: Bench) -> None:
 
 
 @pytest.mark.slow
-def test_a_clock_behind_the_last_record_begins_no_unit_until_a_person_releases_it(
+def test_a_clock_earlier_than_the_last_record_begins_no_unit_until_a_person_releases_it(
     bench: Bench,
 ) -> None:
     bench.clock.now += timedelta(days=365)
@@ -243,7 +245,7 @@ def test_reading_changes_no_byte_and_a_report_of_a_backup_leaves_nothing_beside_
     assert before == {path: path.read_bytes() for path in copy.parent.rglob("*") if path.is_file()}
 
 
-def test_records_on_media_that_nobody_can_write_are_read(
+def test_records_on_media_that_no_one_can_write_are_read(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench.make()
@@ -265,7 +267,7 @@ def test_what_is_no_file_in_place_of_key_or_heads_is_never_waited_for(tmp_path: 
         SigningKey.load(tmp_path / "pipe")
 
 
-def test_a_line_without_end_in_the_heads_is_told_by_its_number(tmp_path: Path) -> None:
+def test_a_line_without_end_in_the_heads_is_reported_by_its_number(tmp_path: Path) -> None:
     (tmp_path / "heads").write_bytes(b"[" * 100_000 + b"\n{}\n")
     found = HeadsFile(tmp_path / "heads").entries()
     assert [each.what for each in found if isinstance(each, HeadsFault)] == [

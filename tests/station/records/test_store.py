@@ -41,7 +41,7 @@ def refusal(bench: Bench, serial: str = SERIAL, socket: str = "A", **more: Any) 
     return caught.value.refusal
 
 
-def test_a_finished_run_says_what_was_done(bench: Bench) -> None:
+def test_a_finished_run_states_what_was_done(bench: Bench) -> None:
     bench.make(lot="L1")
     life = bench.store.read.unit(SERIAL)
     assert life.state is UnitState.PASS
@@ -161,14 +161,14 @@ def test_a_unit_and_a_socket_run_once_at_a_time(bench: Bench) -> None:
         bench.store.read.unit("W2605004")
 
 
-def test_a_refused_claim_leaves_nothing_behind(bench: Bench) -> None:
+def test_a_refused_claim_leaves_nothing(bench: Bench) -> None:
     bench.claim()
     refusal(bench, "W2605009", lot="L9")
     assert not bench.store.read.units("W2605009")
 
 
 @pytest.mark.parametrize("rule", ["block", "verify-only", "reflash-with-reason"])
-def test_a_unit_that_has_passed_is_treated_as_the_recipe_says(bench: Bench, rule: str) -> None:
+def test_a_unit_that_has_passed_is_treated_as_the_recipe_states(bench: Bench, rule: str) -> None:
     bench.make()
     bench.use(f'duplicate = "{rule}"\n' + USUAL)
     if rule == "block":
@@ -321,7 +321,7 @@ def test_threads_may_share_the_records(bench: Bench) -> None:
 
 
 @pytest.mark.slow
-def test_figures_tell_units_from_runs_and_first_tries_from_last(bench: Bench) -> None:
+def test_figures_distinguish_units_from_runs_and_first_tries_from_last(bench: Bench) -> None:
     bench.make(lot="L1")
     bench.make(RunState.FAIL, "W2605003", lot="L1", code="REFUSED")
     bench.make(RunState.PASS, "W2605003", lot="L1")
