@@ -78,7 +78,9 @@ def overview() -> str:
     for state, event, _words, target in host_arrows(is_overview=True):
         to = "stopping" if target is None else target.name.lower()
         drawn.setdefault((state.name.lower(), to), {})[event.value.replace(":", ",")] = None
-    lines += [f"    {state} --> {to} : {'<br/>'.join(told)}" for (state, to), told in drawn.items()]
+    lines += [
+        f"    {state} --> {to} : {'<br/>'.join(noted)}" for (state, to), noted in drawn.items()
+    ]
     lines += ["    stopping --> done : the last message has left", "    done --> [*]"]
     return "\n".join([*lines, "```", ""])
 

@@ -253,7 +253,7 @@ def test_a_wrong_type_or_range_is_refused_with_its_key(tmp_path: Path, text: str
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "reported"),
     [
         ('reset_data = "RST"\n', "reset_data has 3 bytes, but reset_command 0x4205 carries 5"),
         ("frame_gap_s = 0.1\n", "0.1 s between frames is more than 0.08 s"),
@@ -268,8 +268,10 @@ def test_a_wrong_type_or_range_is_refused_with_its_key(tmp_path: Path, text: str
         ("[wmc]\n[mc]\n", "[mc] is a second table for the WMC"),
     ],
 )
-def test_values_that_do_not_fit_together_are_refused(tmp_path: Path, text: str, said: str) -> None:
-    assert said in refused(tmp_path, text).what
+def test_values_that_do_not_fit_together_are_refused(
+    tmp_path: Path, text: str, reported: str
+) -> None:
+    assert reported in refused(tmp_path, text).what
 
 
 def test_what_is_no_toml_is_reported_with_its_line(tmp_path: Path) -> None:

@@ -29,16 +29,16 @@ TOLD: tuple[type[Enum], ...] = (
 )
 
 
-@each("told", TOLD)
-def test_every_member_has_a_word_and_a_text(told: type[Enum]) -> None:
-    for member in told:
+@each("noted", TOLD)
+def test_every_member_has_a_word_and_a_text(noted: type[Enum]) -> None:
+    for member in noted:
         assert member.value == member.name.lower()
         assert wording.wording(member)
-    assert wording._TEXTS[told.__name__].keys() == {member.value for member in told}
+    assert wording._TEXTS[noted.__name__].keys() == {member.value for member in noted}
 
 
 def test_nothing_else_is_in_the_catalogue() -> None:
-    assert wording._TEXTS.keys() == {told.__name__ for told in TOLD}
+    assert wording._TEXTS.keys() == {noted.__name__ for noted in TOLD}
     assert wording._EXPLANATIONS.keys() <= {cause.value for cause in Cause}
 
 

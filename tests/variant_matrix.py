@@ -92,7 +92,7 @@ def cases_of_gate(name: str, fails: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(case_id for case_id in fails if case_id in {*QUICK, clause})
 
 
-def told_otherwise(listed: tuple[str, tuple[str, ...]]) -> str:
+def differs(listed: tuple[str, tuple[str, ...]]) -> str:
     """What the cases listed for a variant say otherwise; "" for nothing."""
     cases = cases_of_gate(*listed)
     row = row_of(listed[0], cases)
@@ -171,7 +171,7 @@ def main(words: Sequence[str] | None = None) -> int:
     options = parser.parse_args(words)
     if options.quick:
         with ProcessPoolExecutor(options.jobs or os.cpu_count()) as pool:
-            found = list(filter(None, pool.map(told_otherwise, listed_rows().items())))
+            found = list(filter(None, pool.map(differs, listed_rows().items())))
         sys.stderr.writelines(f"not as in {PATH.name}: {each}\n" for each in found)
         return 1 if found else 0
     text = document(all_rows(options.jobs))

@@ -47,16 +47,16 @@ def test_a_device_is_flashed_while_the_event_loop_goes_on() -> None:
 
 
 def test_the_loop_gets_what_the_blocking_device_gets() -> None:
-    told: dict[str, list[object]] = {"blocking": [], "async": []}
+    noted: dict[str, list[object]] = {"blocking": [], "async": []}
     with flasher.connect_mock("bms", speed=0) as connection:
-        connection.device("bms").flash(IMAGE, on_event=told["blocking"].append)
+        connection.device("bms").flash(IMAGE, on_event=noted["blocking"].append)
 
     async def work() -> None:
         with flasher.connect_mock("bms", speed=0) as connection:
-            await connection.async_device("bms").flash(IMAGE, on_event=told["async"].append)
+            await connection.async_device("bms").flash(IMAGE, on_event=noted["async"].append)
 
     asyncio.run(work())
-    assert told["async"] == told["blocking"]
+    assert noted["async"] == noted["blocking"]
 
 
 def test_items_and_memory_are_read_and_written() -> None:

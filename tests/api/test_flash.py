@@ -456,10 +456,10 @@ def test_the_examples_of_the_tour_run(
     names: dict[str, Any] = {"flasher": flasher}
     for example in examples:
         exec(example, names)  # noqa: S102  our own documentation
-    said = capsys.readouterr().out
-    assert "PacketAcknowledged(number=613, total=613, tries=1)" in said
-    assert re.search(r"^613 [\d.]+$", said, re.MULTILINE)
-    assert "Ending.COMPLETED DeviceLeft.NEW None" in said
+    reported = capsys.readouterr().out
+    assert "PacketAcknowledged(number=613, total=613, tries=1)" in reported
+    assert re.search(r"^613 [\d.]+$", reported, re.MULTILINE)
+    assert "Ending.COMPLETED DeviceLeft.NEW None" in reported
     assert [bus["interface"] for bus in opened] == ["socketcan", "pcan", "socketcan"]
 
 

@@ -268,8 +268,10 @@ class _Plant:
 
     def _trace(self, run_id: int) -> tuple[str, int]:
         serial = self._unit["serial"]
-        said = run_messages(serial, BMS_VERSION, IMAGES[BMS], written=serial)
-        path = write_trace(self._bench.folder / "run.log.gz", said, at_s=1_779_000_000.0 + run_id)
+        reported = run_messages(serial, BMS_VERSION, IMAGES[BMS], written=serial)
+        path = write_trace(
+            self._bench.folder / "run.log.gz", reported, at_s=1_779_000_000.0 + run_id
+        )
         file = self._bench.store.files.add("trace", path)
         path.unlink()
         return file.sha256, file.size_bytes

@@ -276,8 +276,8 @@ def _runs(store: Store, clock: FakeClock, recipe: LoadedRecipe, folder: Path) ->
     taken_ms: dict[str, list[float]] = {"claim": [], "finish": [], "whole run, 5 commits": []}
     for _ in range(RUNS_MADE):
         serial = f"W27{random.randrange(1, 51):02}{random.randrange(1000):03}"
-        said = run_messages(serial, BMS_VERSION, IMAGES[BMS])
-        trace = write_trace(folder / "made.log.gz", said)
+        reported = run_messages(serial, BMS_VERSION, IMAGES[BMS])
+        trace = write_trace(folder / "made.log.gz", reported)
         began = time.perf_counter()
         try:
             claim = store.claim(Order(serial, "A", "jo"), recipe)

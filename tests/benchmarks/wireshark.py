@@ -58,9 +58,9 @@ def main() -> None:
             ("with it, every field (-V)", (*loaded, "-V")),
         ):
             before_s = _cpu_s()
-            with (folder / "said").open("wb") as said:
+            with (folder / "said").open("wb") as reported:
                 subprocess.run(
-                    ("tshark", "-r", str(capture), *options), stdout=said, check=True,
+                    ("tshark", "-r", str(capture), *options), stdout=reported, check=True,
                     stderr=subprocess.DEVNULL, env={**os.environ, "HOME": named},
                 )  # fmt: skip
             took_s = _cpu_s() - before_s

@@ -336,16 +336,16 @@ def test_a_pause_of_the_computer_is_reported(
     clock: VirtualClock, pause_s: float, reported_s: list[float]
 ) -> None:
     """Where it is longer than half the time that a device has for an ACK (R12)."""
-    told: list[object] = []
-    drive(Recorder(ticks=2), PausingLink(clock, pause_s), clock, on_event=told.append)
-    assert told == [events.HostStalled(each) for each in reported_s]
+    noted: list[object] = []
+    drive(Recorder(ticks=2), PausingLink(clock, pause_s), clock, on_event=noted.append)
+    assert noted == [events.HostStalled(each) for each in reported_s]
 
 
 def test_a_pause_is_reported_in_real_seconds() -> None:
     clock = FastClock()
-    told: list[object] = []
-    drive(Recorder(ticks=2), PausingLink(clock, 20.0), clock, on_event=told.append)
-    assert told == [events.HostStalled(2.0)]
+    noted: list[object] = []
+    drive(Recorder(ticks=2), PausingLink(clock, 20.0), clock, on_event=noted.append)
+    assert noted == [events.HostStalled(2.0)]
 
 
 def test_a_slow_adapter_does_not_hide_a_pause_of_the_same_turn(
@@ -356,15 +356,15 @@ def test_a_slow_adapter_does_not_hide_a_pause_of_the_same_turn(
     clock.wait_until(100.0)
     engine.outbox.append(Frame(0x752, b"\x01"))
     link.send_takes_s = 1.5
-    told: list[object] = []
+    noted: list[object] = []
     pauses_s = iter([0.5])
 
     def is_cancelled() -> bool:
         clock.wait_until(clock.now() + next(pauses_s, 0.0))
         return False
 
-    drive(engine, link, clock, on_event=told.append, cancelled=is_cancelled)
-    assert told == [events.HostStalled(0.5)]
+    drive(engine, link, clock, on_event=noted.append, cancelled=is_cancelled)
+    assert noted == [events.HostStalled(0.5)]
 
 
 def test_a_slow_callback_is_a_pause_and_a_slow_adapter_is_none(
@@ -374,12 +374,12 @@ def test_a_slow_callback_is_a_pause_and_a_slow_adapter_is_none(
     link.send_takes_s = 1.5
     engine.outbox.append(Frame(0x752, b"\x01"))
     engine.events = ["slow"]
-    told: list[object] = []
+    noted: list[object] = []
 
     def on_event(event: object) -> None:
-        told.append(event)
+        noted.append(event)
         if event == "slow":
             clock.wait_until(clock.now() + 0.5)
 
     drive(engine, link, clock, on_event=on_event)
-    assert told == ["slow", events.HostStalled(0.5)]
+    assert noted == ["slow", events.HostStalled(0.5)]

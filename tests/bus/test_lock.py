@@ -128,11 +128,11 @@ def test_who_was_killed_holds_nothing() -> None:
     assert is_free(CAN0)
 
 
-@pytest.mark.parametrize("told", ["", "[]", "{", '{"holder": 1}', "\x00\xff"])
-def test_what_is_beside_the_lock_may_be_anything(state: Path, told: str) -> None:
+@pytest.mark.parametrize("noted", ["", "[]", "{", '{"holder": 1}', "\x00\xff"])
+def test_what_is_beside_the_lock_may_be_anything(state: Path, noted: str) -> None:
     release = lock.acquire(CAN0, "one")
     (note,) = state.glob("flasher/locks/*.json")
-    note.write_text(told)
+    note.write_text(noted)
     with pytest.raises(BusError, match="in use by another program"):
         lock.acquire(CAN0, "another")
     release()

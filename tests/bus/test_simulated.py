@@ -164,11 +164,11 @@ def test_a_device_is_ticked_when_it_wants_to_be() -> None:
     clock = VirtualClock()
     bus = SimulatedBus(BITRATE, clock)
     sleeper = Talker(wake_at=0.25)
-    told: list[object] = []
-    bus.attach(sleeper, told.append)
+    noted: list[object] = []
+    bus.attach(sleeper, noted.append)
     assert bus.link().receive(1.0) is None
     assert sleeper.woken_at == pytest.approx(0.25)
-    assert told == ["woken"]
+    assert noted == ["woken"]
     assert clock.now() == pytest.approx(1.0)
 
 

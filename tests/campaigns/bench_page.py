@@ -50,7 +50,7 @@ class Bench:
     port: int
     page: Page
     stack: ExitStack
-    said: list[str] = field(default_factory=list)
+    reported: list[str] = field(default_factory=list)
     adapter: subprocess.Popen[str] | None = None
     """Where it is a process of its own."""
     ui: subprocess.Popen[str] | None = None
@@ -99,7 +99,7 @@ class Bench:
         return text
 
     def say(self, text: str) -> None:
-        self.said.append(text)
+        self.reported.append(text)
 
     def plug(self) -> tuple[str, ...]:
         """Plug in a serial adapter; returns the arguments that use it."""
@@ -343,8 +343,8 @@ def run(browser: Browser, case: Callable[[Bench], None]) -> tuple[list[str], str
             case(bench)
         except Exception as error:  # noqa: BLE001  a page that never came too
             terminal = (bench.folder / "terminal.txt").read_text().strip()
-            return bench.said, re.sub(r"\s+", " ", f"{error} | {terminal}")[:600]
-    return bench.said, ""
+            return bench.reported, re.sub(r"\s+", " ", f"{error} | {terminal}")[:600]
+    return bench.reported, ""
 
 
 def main() -> int:
@@ -358,12 +358,12 @@ def main() -> int:
             if options.case and case.__name__ not in options.case:
                 continue
             began_at = time.perf_counter()
-            said, wrong = run(browser, case)
+            reported, wrong = run(browser, case)
             took_s = time.perf_counter() - began_at
             bad += bool(wrong)
             verdict = f"DOES NOT HOLD: {wrong}" if wrong else "holds"
             sys.stdout.write(f"{case.__name__:<15} {took_s:5.1f} s  {verdict}\n")
-            sys.stdout.writelines(f"    {each}\n" for each in said)
+            sys.stdout.writelines(f"    {each}\n" for each in reported)
             sys.stdout.flush()
     sys.stdout.write(f"{bad} do not hold\n")
     return 1 if bad else 0

@@ -73,13 +73,13 @@ def beside_processes(folder: Path, seed: int, counts: Counter[str]) -> str:
             for asker in askers:
                 asker.start()
             with Stranger(bus, ASKS_EVERY_S):
-                said = flash.stdout.read()
+                reported = flash.stdout.read()
                 trouble = flash.stderr.read()
             over.set()
         for asker in askers:
             asker.join()
-        counts["foreign queries reported"] += said.count('"ForeignQuery"')
-        counts["messages sent again"] += said.count('"MessageRepeated"')
+        counts["foreign queries reported"] += reported.count('"ForeignQuery"')
+        counts["messages sent again"] += reported.count('"MessageRepeated"')
         if flash.returncode:
             return f"exit code {flash.returncode}: {trouble}"
         mock.wait_for("image:")

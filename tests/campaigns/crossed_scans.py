@@ -291,9 +291,11 @@ class Line:
 
     def _is_at(self, socket: str, share: float) -> bool:
         """The run in this socket has come so far in its flash, or has ended."""
-        said = [each for each in self._shown if each.get("socket") == socket]
-        has_ended = any(each["event"] == "RunEnded" for each in said)
-        shares = [each["share"] for each in said if each.get("step") == "flash" and "share" in each]
+        reported = [each for each in self._shown if each.get("socket") == socket]
+        has_ended = any(each["event"] == "RunEnded" for each in reported)
+        shares = [
+            each["share"] for each in reported if each.get("step") == "flash" and "share" in each
+        ]
         return has_ended or max(shares, default=0.0) >= share
 
     # -- trials -----------------------------------------------------------------------------------
@@ -315,14 +317,14 @@ class Line:
         trial.cross()
         self._end(people)
         self.problems[known:] = [f"{each} ({plan.title})" for each in self.problems[known:]]
-        said = "; ".join(f"{at} {self._ending(label)}" for at, label in enumerate(labels, 1))
+        reported = "; ".join(f"{at} {self._ending(label)}" for at, label in enumerate(labels, 1))
         if plan in self._unheard:
             del self.problems[known:]
-            said += " (undetectable)"
+            reported += " (undetectable)"
         for label in labels:
             self._pull(label)
         self._clear(sockets)
-        return said
+        return reported
 
     def _end(self, people: Sequence[str]) -> None:
         """What waits is cancelled; then all runs end."""
@@ -341,10 +343,10 @@ class Line:
             for each in self._shown
             if label in (each.get("run", each).get("serial"), each.get("text"))
         ]
-        said = [each for each in of_label if each["event"] in ("RunEnded", "ScanRefused")]
-        if not said:
+        reported = [each for each in of_label if each["event"] in ("RunEnded", "ScanRefused")]
+        if not reported:
             return "nothing"
-        last = said[-1]
+        last = reported[-1]
         return (
             str(last["run"]["code"]) if last["event"] == "RunEnded" else f"refused {last['code']}"
         )
@@ -364,24 +366,26 @@ class Line:
         sockets = {port: str(at) for at, port in enumerate(self.ports, 1)}
         for label, own in self._own.items():
             found = self.units.look(label)
-            said = misbound(label, own, found, runs, sockets)
+            reported = misbound(label, own, found, runs, sockets)
             has_passed = any(r["serial"] == label and r["state"] == "pass" for r in runs)
             if has_passed and found["serial"] != label:
-                said.append(f"{Fault.UNTRUE.value}: {label} in the records: {found['serial']!r}")
+                reported.append(
+                    f"{Fault.UNTRUE.value}: {label} in the records: {found['serial']!r}"
+                )
             if self._plans[label] in self._unheard:
                 continue
             others = [each for each, plan in self._plans.items() if plan is self._plans[label]]
             pulled = ", ".join(self._pulled_in.get(each, "no state") for each in others)
             title = f"{self._plans[label].title}, pulled in {pulled}"
-            self.problems += [f"{each} ({title})" for each in said]
+            self.problems += [f"{each} ({title})" for each in reported]
         for each in self._ask("verify")["problems"]:
             self._wrong(Fault.RECORDS, f"{each['where']}: {each['what']}")
         self.judged = self.problems[known:]
 
     def _ask(self, action: str) -> dict[str, list[dict[str, str]]]:
-        with redirect_stdout(StringIO()) as said, redirect_stderr(StringIO()):
+        with redirect_stdout(StringIO()) as reported, redirect_stderr(StringIO()):
             flasher(["station", action, "--json", *self._words[2:4]])
-        document: dict[str, list[dict[str, str]]] = json.loads(said.getvalue().splitlines()[-1])
+        document: dict[str, list[dict[str, str]]] = json.loads(reported.getvalue().splitlines()[-1])
         return document
 
 

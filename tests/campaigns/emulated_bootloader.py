@@ -70,9 +70,9 @@ def _order(monitor: Path, words: list[str]) -> None:
         for order in ["", *orders]:
             if order:
                 line.sendall(order.encode() + b"\n")
-            said = b""
-            while not said.endswith(b"(qemu) "):
-                said += line.recv(4096)
+            reported = b""
+            while not reported.endswith(b"(qemu) "):
+                reported += line.recv(4096)
 
 
 if __name__ == "__main__":

@@ -59,7 +59,7 @@ def main() -> int:
     parser.add_argument("--units", type=int, default=3000)
     parser.add_argument("--sockets", type=int, default=8)
     options = parser.parse_args()
-    told: Sequences = defaultdict(list)
+    noted: Sequences = defaultdict(list)
     shown: Sequences = defaultdict(list)
     with tempfile.TemporaryDirectory() as name, chromium() as browser:
         port, folder = free_port(), Path(name)
@@ -97,15 +97,15 @@ def main() -> int:
         for line in (folder / "events.jsonl").read_text().splitlines():
             event = json.loads(line)
             if event.get("event") == "SocketChanged":
-                _add(told, event["socket"], event["state"], event["serial"])
-    count = sum(map(len, told.values()))
+                _add(noted, event["socket"], event["state"], event["serial"])
+    count = sum(map(len, noted.values()))
     missed = 0
-    for socket, states in told.items():
+    for socket, states in noted.items():
         first = states.index(shown[socket][0]) if shown[socket] else 0  # told before it was opened
         same = difflib.SequenceMatcher(None, states[first:], shown[socket], autojunk=False)
         missed += len(states[first:]) - sum(block.size for block in same.get_matching_blocks())
     if missed:
-        sys.stdout.write(f"told {dict(told)}\nshown {dict(shown)}\n")
+        sys.stdout.write(f"told {dict(noted)}\nshown {dict(shown)}\n")
     sys.stdout.write(f"{count} states of {options.units} units, {missed} not shown\n")
     return 1 if missed else 0
 

@@ -116,8 +116,8 @@ def _one_run(store: Store, recipe: Any, folder: Path, serial: str, chance: rando
     measured = Measurement("voltage", 36.0 + chance.random(), "V", 30.0, 42.0)
     state = StepState.PASS if is_good else StepState.FAIL
     store.step(run_id, "flash", state, duration_s=0.01, measurements=[measured])
-    said = run_messages(serial, BMS_VERSION, IMAGES[BMS])
-    trace = write_trace(folder / "run.log.gz", said, at_s=time.time())
+    reported = run_messages(serial, BMS_VERSION, IMAGES[BMS])
+    trace = write_trace(folder / "run.log.gz", reported, at_s=time.time())
     file = store.files.add("trace", trace)
     end = RunResult(RunState.FAIL, "NO_ANSWER", "", 8.0, {}, file.sha256, [file])
     if is_good:

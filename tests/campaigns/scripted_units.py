@@ -109,12 +109,12 @@ class Unit(ScriptedDevice):
         """It has sent nothing since it got power, or since it confirmed a reset: the announcement
         of another unit cannot be told from its own then.
         """
-        said: list[str] = []
+        reported: list[str] = []
         for entry in reversed(self.log):
             if entry.what in ("power", "reset"):
                 wanted = ["feedback"] if entry.what == "reset" else []
-                return said == wanted and not self._sent_frames
-            said += [entry.what] if entry.kind == "said" else []
+                return reported == wanted and not self._sent_frames
+            reported += [entry.what] if entry.kind == "said" else []
         return False
 
     def power_off(self) -> None:

@@ -211,10 +211,10 @@ async def _measure(options: argparse.Namespace, pid: int, port: int) -> int:
             task.cancel()
     most = attacker.most_in_a_minute
     words = {0: "connection ended", 303: "let in", 403: "wrong", 429: "too many", 503: "busy"}
-    said = defaultdict(int, {words.get(code, str(code)): n for code, n in statuses.items()})
+    reported = defaultdict(int, {words.get(code, str(code)): n for code, n in statuses.items()})
     sys.stdout.write(
         f"{statuses.total()} tries in {options.seconds:g} s, {options.count} at once:"
-        f" {', '.join(f'{n} {what}' for what, n in sorted(said.items()))}\n"
+        f" {', '.join(f'{n} {what}' for what, n in sorted(reported.items()))}\n"
         f"checked: {len(attacker.checked_s)}; at most {most} in a minute\n"
         f"the owner at another address: {let_in}, after {owner_s:.1f} s\n"
         f"peak memory of the station: {_mib(pid, 'VmHWM'):.0f} MiB, {before_mib:.0f} before\n"

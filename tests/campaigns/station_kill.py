@@ -200,15 +200,15 @@ class Campaign:
 
     def _check_records(self) -> None:
         """What was shown is in the records, and the records hold together."""
-        said = {action: self._ask(action) for action in ("verify", "report")}
-        problems = said["verify"]["problems"]
+        reported = {action: self._ask(action) for action in ("verify", "report")}
+        problems = reported["verify"]["problems"]
         for each in problems:
             self._wrong(Fault.RECORDS, f"{each['where']}: {each['what']}")
-        found = self.operator.strange_units(said["report"]["runs"])
-        found += self.operator.false_passes(said["report"]["runs"])
+        found = self.operator.strange_units(reported["report"]["runs"])
+        found += self.operator.false_passes(reported["report"]["runs"])
         # What was done to a unit is found again after each kill.
         self.problems += [each for each in found if each not in self.problems]
-        runs = {run["run_id"]: run for run in said["report"]["runs"]}
+        runs = {run["run_id"]: run for run in reported["report"]["runs"]}
         for event in self.operator.shown:
             shown = event.get("run", event)  # the whole run in RunEnded
             run = runs.get(shown["run_id"])
@@ -225,9 +225,9 @@ class Campaign:
         self.counts["saved pass, the kill was before it was shown"] = states.count("pass") - passes
 
     def _ask(self, action: str) -> dict[str, list[dict[str, str]]]:
-        with redirect_stdout(StringIO()) as said, redirect_stderr(StringIO()):
+        with redirect_stdout(StringIO()) as reported, redirect_stderr(StringIO()):
             flasher(["station", action, "--json", *self._words[2:4]])
-        document: dict[str, list[dict[str, str]]] = json.loads(said.getvalue().splitlines()[-1])
+        document: dict[str, list[dict[str, str]]] = json.loads(reported.getvalue().splitlines()[-1])
         if "error" in document:
             self._wrong(Fault.RECORDS, f"station {action}: {document['error']}")
         return {"problems": [], "runs": [], **document}

@@ -203,7 +203,7 @@ class Operator:
     _own: dict[str, str] = field(default_factory=dict)
     """Of every unit: the serial number that it came with."""
     _passed: set[str] = field(default_factory=set)
-    _said: list[str] = field(default_factory=list)
+    _reported: list[str] = field(default_factory=list)
     """What the station answered to the last scan."""
     _answer: str = ""
     _is_open: bool = False
@@ -271,10 +271,10 @@ class Operator:
                 self._answer = "accepted"
             case "ScanRefused":
                 self._answer = "refused"
-                self._said.append(f"{event['reason']} {event['remedy']}")
+                self._reported.append(f"{event['reason']} {event['remedy']}")
                 self.counts[f"refused {event['code']}"] += 1
             case "OperatorPrompted" if not _CYCLE.search(event["text"]):
-                self._said.append(event["text"])
+                self._reported.append(event["text"])
             case "LineStopped":
                 self._stopped, self._resume_at = True, time.perf_counter() + 1.0
                 self.counts["line stopped"] += 1
@@ -492,12 +492,12 @@ class Operator:
 
     def _named(self, place: Place) -> Place:
         """The socket that the station names, when nothing is in it; else the one meant."""
-        named = _NAMED.search(" ".join(self._said))
+        named = _NAMED.search(" ".join(self._reported))
         chosen = self.places[named[1]] if named else place
         return place if chosen.unit else chosen
 
     def _wants_card(self) -> bool:
-        return bool(_CARD.search(" ".join(self._said)))
+        return bool(_CARD.search(" ".join(self._reported)))
 
     def _put(self, label: str, place: Place) -> None:
         place.unit, place.changed_at, place.tries = label, time.perf_counter(), 0
@@ -529,7 +529,7 @@ class Operator:
                 self.counts["unit moved, as the station said"] += 1
         if self._answer == "accepted":
             self._see_run(place.unit, place, over)
-        elif free := _FREE.search(" ".join(self._said)):
+        elif free := _FREE.search(" ".join(self._reported)):
             self._scan(f"FREE {free[1]}")  # it is out: here one unit of a label is in one place
         place.changed_at = time.perf_counter()
 
@@ -542,10 +542,10 @@ class Operator:
     def _see_run(self, label: str, place: Place, over: Callable[[], bool]) -> None:
         """Wait until the run has begun, while the other sockets go on by themselves."""
         give_up_at = time.perf_counter() + _ATTEMPT_S
-        refusals = len(self._said)
+        refusals = len(self._reported)
         while time.perf_counter() < give_up_at and self._is_there() and not over():
             self._read(_TURN_S)
-            if len(self._said) > refusals or label in self._passed or self._stopped:
+            if len(self._reported) > refusals or label in self._passed or self._stopped:
                 return
             if any(
                 each["event"] == "RunStarted" and each["serial"] == label
@@ -558,7 +558,7 @@ class Operator:
         if not self._is_there():
             return False
         assert self.station is not None
-        self._said.clear()
+        self._reported.clear()
         self._answer = ""
         self.station.scan(text)
         give_up_at = time.perf_counter() + _ANSWER_S
@@ -584,21 +584,21 @@ class Operator:
         """What is wrong with the units, by these runs of the records."""
         sockets = {place.port: place.name for place in self.places.values()}
         runs = list(runs)
-        said = []
+        reported = []
         for label, own in self._own.items():
-            said += misbound(label, own, self.units.look(label), runs, sockets)
-        return said
+            reported += misbound(label, own, self.units.look(label), runs, sockets)
+        return reported
 
     def false_passes(self, runs: Iterable[Mapping[str, Any]]) -> list[str]:
         """Units that are not what the records say; also those whose PASS was never shown."""
-        said = []
+        reported = []
         for serial in sorted({run["serial"] for run in runs if run["state"] == "pass"}):
             found = self.units.look(serial) if serial in self._own else {}
             if found.get("serial") != serial or found.get("image") != self.image.hex():
                 number = repr(found.get("serial"))
-                said.append(f"{Fault.UNTRUE.value}: in the records {serial} is one, its unit"
+                reported.append(f"{Fault.UNTRUE.value}: in the records {serial} is one, its unit"
                             f" has the number {number}")  # fmt: skip
-        return said
+        return reported
 
     @property
     def passed(self) -> set[str]:
@@ -617,9 +617,9 @@ def misbound(
     has another one, or was flashed or written in a run of another label. `found` is what it says
     (`Units.look`), `sockets` are the names of the sockets by their ports.
     """
-    said = []
+    reported = []
     if found["serial"] not in (label, own):
-        said.append(f"unit {label} has the number {found['serial']}")
+        reported.append(f"unit {label} has the number {found['serial']}")
     for at, port, number in found["done"]:
         begun = [
             (datetime.fromisoformat(run["begun_at"]).timestamp(), run["serial"])
@@ -629,5 +629,5 @@ def misbound(
         _, serial = max((each for each in begun if each[0] <= at), default=(0.0, ""))
         if serial != label:
             deed = f"got the number {number}" if number else "was flashed"
-            said.append(f"unit {label} {deed} in socket {sockets[port]} in a run of {serial}")
-    return [f"{Fault.MISBOUND.value}: {each}" for each in dict.fromkeys(said)]
+            reported.append(f"unit {label} {deed} in socket {sockets[port]} in a run of {serial}")
+    return [f"{Fault.MISBOUND.value}: {each}" for each in dict.fromkeys(reported)]

@@ -39,9 +39,9 @@ def main() -> int:
             found, expected = list(items(capture, folder)), list(cases.decoded(reel, WELLING))
             differences += abs(len(found) - len(expected))
             for item, (number, event) in zip(found, expected, strict=False):
-                said = (item.frame, item.one("kind"), item.one("message"), cases.shown(item))
+                reported = (item.frame, item.one("kind"), item.one("message"), cases.shown(item))
                 values = cases.expected_of(event)
-                differences += said != (number, event.kind.value, event.title, values)
+                differences += reported != (number, event.kind.value, event.title, values)
                 fields += len(values)
             frames += len(reel.frames)
             messages += len(expected)

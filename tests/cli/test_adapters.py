@@ -281,8 +281,10 @@ def test_flash_goes_on_where_the_device_answers_and_reports_it(
         machine.wire = wire
         run = flasher("flash", short_bms, "-t", "bms")
     assert run.code == ExitCode.OK
-    said = run.err.index
-    assert said("using the only one found") < said("the BMS is there") < said("resetting")
+    reported = run.err.index
+    assert (
+        reported("using the only one found") < reported("the BMS is there") < reported("resetting")
+    )
 
 
 def test_rescue_needs_no_word_before_the_announcement_that_it_waits_for(

@@ -149,9 +149,9 @@ def test_a_shell_learns_how_to_ask(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch, shell: str
 ) -> None:
     monkeypatch.setenv("_FLASHER_COMPLETE", f"{shell}_source")
-    told = flasher()
-    assert told.code == ExitCode.OK
-    assert f"_FLASHER_COMPLETE={shell}_complete" in told.out
+    printed = flasher()
+    assert printed.code == ExitCode.OK
+    assert f"_FLASHER_COMPLETE={shell}_complete" in printed.out
 
 
 # -- help ------------------------------------------------------------------------------------------
@@ -178,12 +178,12 @@ def test_help_is_a_manual_page(
 ) -> None:
     for columns in (60, 80, 200):
         monkeypatch.setenv("COLUMNS", str(columns))
-        said = flasher(*([command] if command else []), "--help").out
-        assert max(map(len, said.splitlines())) <= 100
+        reported = flasher(*([command] if command else []), "--help").out
+        assert max(map(len, reported.splitlines())) <= 100
         for section in ("Usage: flasher", "output:", "examples:", "exit codes:"):
-            assert section in said
-        assert "NO_COLOR" in said
-        assert "R|" not in said
+            assert section in reported
+        assert "NO_COLOR" in reported
+        assert "R|" not in reported
     assert command_of(command).help
     assert len(examples_of(command_of(command))) >= 3
 
@@ -229,7 +229,7 @@ def test_actions_of_a_command_take_the_output_options_too(command: str) -> None:
 
 
 def test_help_lists_the_commands_by_purpose(flasher: Flasher) -> None:
-    said = flasher("--help").out
+    reported = flasher("--help").out
     for title in (
         "upgrade a device",
         "look at devices and the bus",
@@ -238,13 +238,13 @@ def test_help_lists_the_commands_by_purpose(flasher: Flasher) -> None:
         "at the end of a production line",
         "what a product does its own way",
     ):
-        assert f"\n{title}:\n" in said
+        assert f"\n{title}:\n" in reported
     for name, entry in COMMANDS.items():
-        assert re.search(rf"^  {name} +{re.escape(entry.summary)}$", said, re.MULTILINE)
+        assert re.search(rf"^  {name} +{re.escape(entry.summary)}$", reported, re.MULTILINE)
 
 
 @pytest.mark.parametrize(
-    ("command", "told", "untold"),
+    ("command", "printed", "not_printed"),
     [
         ("image-info", ["3 image rejected"], ["5 no answer", "CAN_INTERFACE"]),
         (
@@ -257,12 +257,12 @@ def test_help_lists_the_commands_by_purpose(flasher: Flasher) -> None:
     ],
 )
 def test_help_lists_the_exit_codes_and_what_is_read(
-    flasher: Flasher, command: str | None, told: list[str], untold: list[str]
+    flasher: Flasher, command: str | None, printed: list[str], not_printed: list[str]
 ) -> None:
-    said = flasher(*([command] if command else []), "--help").out
-    said = said[said.index("exit codes:") :]
-    assert all(text in said for text in told)
-    assert not any(text in said for text in untold)
+    reported = flasher(*([command] if command else []), "--help").out
+    reported = reported[reported.index("exit codes:") :]
+    assert all(text in reported for text in printed)
+    assert not any(text in reported for text in not_printed)
 
 
 def test_an_action_reports_what_it_reads(flasher: Flasher) -> None:

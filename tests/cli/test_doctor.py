@@ -121,7 +121,7 @@ def test_a_second_tool_is_a_problem(flasher: Flasher, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize(
-    ("said", "words", "severity", "fix"),
+    ("reported", "words", "severity", "fix"),
     [
         (
             (0x720, 0x1308, b"SHUTDOWN"),
@@ -143,12 +143,12 @@ def test_a_second_tool_is_a_problem(flasher: Flasher, monkeypatch: pytest.Monkey
 def test_what_is_sent_on_the_bus(
     flasher: Flasher,
     monkeypatch: pytest.MonkeyPatch,
-    said: tuple[int, int, bytes],
+    reported: tuple[int, int, bytes],
     words: str,
     severity: str,
     fix: str | None,
 ) -> None:
-    run = listen(flasher, monkeypatch, saying(said))
+    run = listen(flasher, monkeypatch, saying(reported))
     assert run.code == ExitCode.OK
     how_bad, commands = one(run, words)
     assert how_bad == severity
@@ -563,5 +563,5 @@ def test_the_arguments_of_the_back_end_are_in_the_command_that_is_named(examine:
 
 
 def test_it_states_where_it_listens(flasher: Flasher) -> None:
-    said = flasher("doctor", *MOCK, "--listen", "0.5").err
-    assert said == "listening for 0.5 s on the built-in mock ...\n"
+    reported = flasher("doctor", *MOCK, "--listen", "0.5").err
+    assert reported == "listening for 0.5 s on the built-in mock ...\n"

@@ -138,7 +138,7 @@ def silent(scene: Scene) -> Words:
     return scene.flash()
 
 
-def nobody_cycles_the_power(scene: Scene) -> Words:
+def no_one_cycles_the_power(scene: Scene) -> Words:
     words = scene.flash("--wait", "5")
     return ("rescue", *words[1:])
 
@@ -267,7 +267,7 @@ CASES = [
     Case("second tool, forced", ExitCode.BUS, second_tool_forced,
          "packet", "another program", "End the other"),
     Case("silent", ExitCode.NO_ANSWER, silent, "boot version", "no power", "Check supply"),
-    Case("not power-cycled", ExitCode.NO_ANSWER, nobody_cycles_the_power,
+    Case("not power-cycled", ExitCode.NO_ANSWER, no_one_cycles_the_power,
          "boot version", "it was not switched off", "--wait"),
     Case("another device", ExitCode.WRONG_DEVICE, other_boot_name,
          "boot version", "reports BMS", "--allow-boot-name"),

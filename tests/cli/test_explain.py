@@ -137,15 +137,15 @@ def test_where_the_trace_of_a_bundle_breaks_off_the_tool_gave_up_and_not_the_rec
     assert run.code == ExitCode.TRANSFER
     (bundle,) = tmp_path.iterdir()
     page = tmp_path / "story.html"
-    told = flasher("explain", bundle, "--html", page).out
-    assert "verdict: the tool gave up in the middle (transferring, packet " in told
-    assert "Here the tool ended: OBC: the overall deadline passed." in told
-    assert "the recording was stopped" not in told
+    printed = flasher("explain", bundle, "--html", page).out
+    assert "verdict: the tool gave up in the middle (transferring, packet " in printed
+    assert "Here the tool ended: OBC: the overall deadline passed." in printed
+    assert "the recording was stopped" not in printed
     assert "what to do: Allow more time with --timeout" in page.read_text()
     for name in ("trace.blf", "report.json"):
         refused = flasher("explain", bundle, "--html", bundle / name)
         assert refused.code == ExitCode.USAGE
-    assert flasher("explain", bundle).out == told
+    assert flasher("explain", bundle).out == printed
 
 
 def test_what_was_not_answered_is_marked_and_red(
@@ -155,8 +155,8 @@ def test_what_was_not_answered_is_marked_and_red(
     tape.packets(1, 4).packet(5).wait(0.5).packet(5).ack(5).packet(6).wait(3.0)
     tape.message(0x710, 0x0C, 0x1305, b"READY")
     path = tape.save(tmp_path / "t.log")
-    told = flasher("explain", path, "--html", tmp_path / "t.html").out.splitlines()
-    marked = [line.split("  ! ")[1] for line in told if "  ! " in line]
+    printed = flasher("explain", path, "--html", tmp_path / "t.html").out.splitlines()
+    marked = [line.split("  ! ")[1] for line in printed if "  ! " in line]
     assert marked == [
         "reset: not answered",
         "packet: number 5, total 10, not answered",
@@ -172,10 +172,10 @@ def test_what_was_not_answered_is_marked_and_red(
 def test_no_share_of_a_line_is_more_than_all_of_it(flasher: Flasher, tmp_path: Path) -> None:
     path = Tape().to_end().complete().save(tmp_path / "t.log")
     for words in ((), ("--html", tmp_path / "t.html")):
-        told = flasher("explain", path, "-b", "20000", *words).out
-        assert "more than all of 20 kbit/s" in told
-        shares = re.findall(r"([\d.]+) ?%", told)
-        assert all(float(share) <= 100 for share in shares), told
+        printed = flasher("explain", path, "-b", "20000", *words).out
+        assert "more than all of 20 kbit/s" in printed
+        shares = re.findall(r"([\d.]+) ?%", printed)
+        assert all(float(share) <= 100 for share in shares), printed
     page = (tmp_path / "t.html").read_text("utf-8")
     assert "more than the line carries" in page
 
@@ -192,8 +192,8 @@ def test_a_trace_of_the_conformance_suite_is_no_second_tool(
         "--variant", "reset-in-transfer-hangs",
     )  # fmt: skip
     assert ran.code == ExitCode.PARTIAL, ran.out
-    told = flasher("explain", tmp_path / "TX-13.log").out
-    assert "two tools" not in told
+    printed = flasher("explain", tmp_path / "TX-13.log").out
+    assert "two tools" not in printed
     suite = tmp_path / "suite.log"
     suite.write_text(plain.read_text().replace(" can0 ", " conformance "))
     assert "two tools" not in flasher("explain", suite).out

@@ -100,11 +100,11 @@ def test_remarks_stand_where_something_went_wrong(
     assert document["remarks"] == 4
     assert document["frames"] == len(list(read_trace(trace)))
     raw = path.read_bytes()
-    for said in (
+    for reported in (
         b"NAK: number 4", b"damaged bytes: reason wrong CRC", b"not answered",
         b"BMS, end of the upgrade: The BMS has every packet",
     ):  # fmt: skip
-        assert raw.count(said) == 1, said
+        assert raw.count(reported) == 1, reported
 
 
 def test_a_trace_that_is_cut_off_is_written_up_to_there(flasher: Flasher, tmp_path: Path) -> None:
@@ -118,7 +118,7 @@ def test_a_trace_that_is_cut_off_is_written_up_to_there(flasher: Flasher, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "reported"),
     [
         ("out.xyz", "no trace format has this suffix"),
         ("out.pcap", "no trace format has this suffix"),
@@ -127,12 +127,12 @@ def test_a_trace_that_is_cut_off_is_written_up_to_there(flasher: Flasher, tmp_pa
     ],
 )
 def test_what_cannot_be_written_is_reported(
-    flasher: Flasher, trace: Path, tmp_path: Path, name: str, said: str
+    flasher: Flasher, trace: Path, tmp_path: Path, name: str, reported: str
 ) -> None:
     before = trace.read_bytes()
     ran = flasher("export", "trace", trace, "-o", tmp_path / name)
     assert ran.code == ExitCode.USAGE
-    assert said in ran.err
+    assert reported in ran.err
     assert str(tmp_path / name) in ran.err
     assert [each.name for each in tmp_path.iterdir()] == [trace.name]
     assert trace.read_bytes() == before

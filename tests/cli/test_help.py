@@ -10,7 +10,7 @@ from typing import Final
 
 import pytest
 
-import flasher.cli.look.help as told
+import flasher.cli.look.help as printed
 import flasher.station.records.errors
 from flasher import errors
 from flasher.errors import ErrorCode, ExitCode, FlasherError
@@ -34,12 +34,12 @@ def exit_code_in(code: ErrorCode) -> int:
 
 
 def test_the_page_explains_each_code_in_order() -> None:
-    assert list(told.error_codes()) == [code.value for code in ErrorCode]
+    assert list(printed.error_codes()) == [code.value for code in ErrorCode]
 
 
 def test_each_code_is_explained_to_its_end() -> None:
     page = (PACKAGE / "error_codes.md").read_text(encoding="utf-8")
-    for code, one in told.error_codes().items():
+    for code, one in printed.error_codes().items():
         section = page.partition(f"## {code}: ")[2].partition("\n## ")[0]
         assert f"{one.title}\n\n{one.text}" == section.strip().replace("**", "")
 
@@ -75,18 +75,18 @@ def test_the_code_of_an_error_has_the_exit_code_of_its_class() -> None:
 def test_a_code_is_printed_and_explained(flasher: Flasher) -> None:
     failed = flasher("flash", "nix.bin", "-t", "bms")
     assert failed.err.splitlines()[0].endswith("no file of this name. [E201]")
-    said = flasher("help", "e201")
-    assert said.out.startswith("E201: a file cannot be read\n\nThere is no file of this name")
-    assert "What to do: correct the name." in said.out
+    reported = flasher("help", "e201")
+    assert reported.out.startswith("E201: a file cannot be read\n\nThere is no file of this name")
+    assert "What to do: correct the name." in reported.out
     assert flasher("flash", "nix.bin", "-t", "bms", "--json").document["error"]["code"] == "E201"
 
 
 @pytest.mark.parametrize("code", ["E202", "E503", "E504"])
 def test_a_code_does_not_claim_that_nothing_was_done(flasher: Flasher, code: str) -> None:
     """Each is the error of a first attempt, and of a later one behind an erased application."""
-    said = flasher("help", code).out.lower()
+    reported = flasher("help", code).out.lower()
     for claim in ("nothing was", "nothing has", "is still there"):
-        assert claim not in said
+        assert claim not in reported
 
 
 def test_a_file_with_faults_has_their_code(flasher: Flasher, tmp_path: Path) -> None:

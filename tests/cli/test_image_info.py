@@ -137,8 +137,8 @@ def test_gaps_count_in_the_planned_time(flasher: Flasher) -> None:
     gaps = ("--frame-gap", "0.01", "--packet-gap", "0.1")
     plan = flasher("image-info", SAMPLES / "bms.bin", *gaps, "--json").document["plan"]
     assert plan["gaps_s"] == pytest.approx(0.01 * (613 * 17 + 1 + 2 + 1) + 0.1 * 614)
-    said = flasher("image-info", SAMPLES / "bms.bin", *gaps).out
-    assert "on the wire, 2 min 45 s of gaps" in said
+    reported = flasher("image-info", SAMPLES / "bms.bin", *gaps).out
+    assert "on the wire, 2 min 45 s of gaps" in reported
 
 
 def test_an_outside_vector_is_refused_until_waived(flasher: Flasher) -> None:

@@ -43,9 +43,9 @@ def test_the_file_has_what_was_run_what_was_reported_and_how_it_ended(
     written = records(path)
     assert written[0][0] == "INFO"
     assert "flasher scan --mock --mock-speed 0 --log-file" in written[0][2]
-    said = {text for _, _, text in written}
+    reported = {text for _, _, text in written}
     for line in (*run.out.splitlines(), *run.err.splitlines()):
-        assert not line.strip() or line in said or line.startswith("  ")
+        assert not line.strip() or line in reported or line.startswith("  ")
     assert written[-1] == ("INFO", "flasher.cli", "exit code 0")
 
 
@@ -313,9 +313,9 @@ def test_a_bus_that_could_not_be_opened_is_no_warning_beside_its_failure(
         raise OSError("no socket")
 
     monkeypatch.setattr("can.Bus", fails)
-    said = flasher("scan", "-i", "virtual", "-c", "x").err
-    assert "The adapter cannot be opened" in said
-    assert "something else" in said
-    assert "properly" not in said
-    assert "Could not access" not in said
-    assert "Traceback" not in said
+    reported = flasher("scan", "-i", "virtual", "-c", "x").err
+    assert "The adapter cannot be opened" in reported
+    assert "something else" in reported
+    assert "properly" not in reported
+    assert "Could not access" not in reported
+    assert "Traceback" not in reported

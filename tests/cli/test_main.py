@@ -243,7 +243,7 @@ def test_wrong_usage_is_a_json_document_too(flasher: Flasher, words: tuple[str, 
 
 
 @pytest.mark.parametrize(
-    ("words", "said", "remedy"),
+    ("words", "reported", "remedy"),
     [
         (("flas",), "flasher: No such command 'flas'.", "Did you mean flash?"),
         (("flash", "--verfy", "none"), "flasher flash: No such option '--verfy'.", "--verify"),
@@ -254,10 +254,10 @@ def test_wrong_usage_is_a_json_document_too(flasher: Flasher, words: tuple[str, 
     ],
 )
 def test_wrong_usage_states_what_is_wrong_and_what_was_meant(
-    flasher: Flasher, words: tuple[str, ...], said: str, remedy: str
+    flasher: Flasher, words: tuple[str, ...], reported: str, remedy: str
 ) -> None:
     run = flasher(*words)
     assert run.code == ExitCode.USAGE
-    assert said in run.err
+    assert reported in run.err
     assert remedy in run.err.partition("what to do: ")[2]
     assert run.out == ""

@@ -115,7 +115,7 @@ def test_create_warns_when_the_image_names_another_target_too(
 
 
 @pytest.mark.parametrize(
-    ("option", "value", "said"),
+    ("option", "value", "reported"),
     [
         ("--firmware-version", "1.0", "Vxrxrx_YYYYMMDD"),
         ("--minimum-boot-version", "V1", "Vx.x.x"),
@@ -125,11 +125,11 @@ def test_create_warns_when_the_image_names_another_target_too(
     ],
 )
 def test_create_refuses_values_that_no_manifest_holds(
-    flasher: Flasher, image: Path, option: str, value: str, said: str
+    flasher: Flasher, image: Path, option: str, value: str, reported: str
 ) -> None:
     run = flasher("manifest", "create", image, "-t", "bms", option, value)
     assert run.code == ExitCode.USAGE
-    assert said in run.err
+    assert reported in run.err
     assert "\x1b" not in run.err
     assert list(image.parent.iterdir()) == [image]
 
@@ -150,7 +150,7 @@ def test_check_states_line_by_line_what_was_checked(
     run = flasher("manifest", "check", image, "-t", "bms")
     assert run.code == ExitCode.OK
     lines = [line.split(":", 1) for line in run.out.splitlines()[1:]]
-    assert {label.strip(): said.strip() for label, said in lines} == {
+    assert {label.strip(): reported.strip() for label, reported in lines} == {
         "size_bytes": "4096: agrees",
         "sha256": f"{sha256}: agrees",
         "firmware_version": "V1r0r4_20220512: agrees",

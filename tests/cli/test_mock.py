@@ -569,7 +569,7 @@ def test_the_list_of_variants_is_a_json_document(flasher: Flasher) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "reported"),
     [
         (("--variant", "no-crc"), "no variant 'no-crc' of the device model"),
         (("--variant", "no-crc"), "Did you mean no-crc-check?"),
@@ -577,11 +577,11 @@ def test_the_list_of_variants_is_a_json_document(flasher: Flasher) -> None:
     ],
 )
 def test_a_variant_that_cannot_be_served_is_wrong_usage(
-    serve: Serve, words: tuple[str, ...], said: str
+    serve: Serve, words: tuple[str, ...], reported: str
 ) -> None:
     run = serve(*words)
     assert run.code == ExitCode.USAGE
-    assert said in run.err
+    assert reported in run.err
 
 
 def test_without_a_target_it_is_wrong_usage(flasher: Flasher) -> None:

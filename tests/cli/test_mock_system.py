@@ -35,7 +35,7 @@ class Tool:
 
     def __init__(self, *messages: tuple[int, int, int, bytes]) -> None:
         self.heard: list[Frame] = []
-        self.said = 0
+        self.reported = 0
         self._frames = [
             (0.1 * (index + 1), Frame(message[0], payload))
             for index, message in enumerate(messages)

@@ -151,7 +151,7 @@ def test_a_table_of_a_trace_is_printed_once(
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "reported"),
     [
         (("none.asc",), "cannot be read"),
         (("none.xyz",), "no trace format has this suffix"),
@@ -164,12 +164,12 @@ def test_a_table_of_a_trace_is_printed_once(
     ],
 )
 def test_wrong_usage_states_what_is_wrong(
-    flasher: Flasher, words: tuple[str, ...], said: str
+    flasher: Flasher, words: tuple[str, ...], reported: str
 ) -> None:
     run = flasher("monitor", *words)
     assert run.code == ExitCode.USAGE
     assert run.out == ""
-    assert said in run.err
+    assert reported in run.err
 
 
 # -- live ------------------------------------------------------------------------------------------

@@ -170,10 +170,10 @@ def test_a_bundle_of_before_is_still_explained(flasher: Flasher, bundle_folder: 
     with can.Logger(bundle / "trace.log") as log, can.LogReader(bundle / "trace.blf") as messages:
         for message in messages:
             log(message)
-    told = flasher("explain", bundle).out.splitlines()
+    printed = flasher("explain", bundle).out.splitlines()
     (bundle / "trace.blf").unlink()
-    assert flasher("explain", bundle).out.splitlines()[:8] == told[:8]
-    assert "reported then: exit code 4" in told
+    assert flasher("explain", bundle).out.splitlines()[:8] == printed[:8]
+    assert "reported then: exit code 4" in printed
 
 
 def test_a_bug_leaves_a_bundle_with_its_traceback(bundle_folder: Path) -> None:
@@ -294,8 +294,8 @@ def test_commands_record_what_they_ask(
     assert flasher(*words, *MOCK, "--trace-file", trace).code == 0
     assert bundles(bundle_folder) == []
     assert "752" in trace.read_text() or words == ("scan",)
-    told = flasher("explain", trace)
-    assert "verdict: no upgrade, but drive-system traffic" in told.out
+    printed = flasher("explain", trace)
+    assert "verdict: no upgrade, but drive-system traffic" in printed.out
 
 
 def test_a_silent_device_leaves_a_bundle_that_is_explained(
@@ -311,11 +311,11 @@ def test_a_silent_device_leaves_a_bundle_that_is_explained(
     assert run.code == 5
     (bundle,) = bundles(bundle_folder)
     assert f"bundle: {bundle}" in run.err
-    told = flasher("explain", bundle)
-    assert told.code == 0
-    assert "reported then: exit code 5" in told.out
-    assert "flasher read version-information --mock" in told.out
-    assert "The BMS did not answer." in told.out
+    printed = flasher("explain", bundle)
+    assert printed.code == 0
+    assert "reported then: exit code 5" in printed.out
+    assert "flasher read version-information --mock" in printed.out
+    assert "The BMS did not answer." in printed.out
 
 
 @pytest.mark.slow

@@ -21,9 +21,9 @@ from tests.cli.conftest import SAMPLES, Flasher
 from tests.end_to_end.stage import IMAGE, SMALL, Stage
 
 
-def repair_named_in(said: str) -> list[str]:
+def repair_named_in(reported: str) -> list[str]:
     """The words of the command on the line behind "to repair it:", as a shell parts them."""
-    lines = said.splitlines()
+    lines = reported.splitlines()
     words = shlex.split(lines[lines.index("  to repair it:") + 1])
     assert words[:1] == ["flasher"]
     return words[1:]

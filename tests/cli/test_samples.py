@@ -32,7 +32,7 @@ EVERYTHING = ("--force", *(f"--allow-{name}" for name in sorted(WAIVERS)))
 
 
 @pytest.fixture(autouse=True)
-def nobody_sends(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def no_command_sends(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Listens at a bus that counts as a real one."""
     for place in ("bus.adapter", "station.adapters", "cli.upgrade.bench_page"):
         monkeypatch.setattr(f"flasher.{place}.is_physical", lambda *_: True)

@@ -92,9 +92,9 @@ def test_everything_that_is_wrong_with_a_recipe_is_reported(
     assert "Did you mean part?" in run.err
     run = flasher("station", "check", recipe, "--json")
     hold_output(schema, run.out, 2)
-    said = [f"{finding['where']} {finding['what']}" for finding in run.document["findings"]]
-    assert said[:2] == ["parts unknown key.", "revison unknown key."]
-    assert "has no part and no revision" in said[2]
+    reported = [f"{finding['where']} {finding['what']}" for finding in run.document["findings"]]
+    assert reported[:2] == ["parts unknown key.", "revison unknown key."]
+    assert "has no part and no revision" in reported[2]
 
 
 def test_a_changed_image_is_found_before_the_shift(flasher: Flasher, recipe: Path) -> None:
@@ -119,11 +119,11 @@ def test_the_sockets_are_checked_with_the_recipe(
     (tmp_path / "label.zpl").write_text("{{ serail }}", "utf-8")
     badge = f'[[person]]\nname = "Jo"\ncode = "{SERIAL}"\nrole = "operator"\n'
     (tmp_path / "badges.toml").write_text(badge, "utf-8")
-    for text, said in beside.items():
+    for text, reported in beside.items():
         sockets.write_text(f'{text}[[socket]]\nname = "A"\nmock = {{}}\n', "utf-8")
         run = flasher("station", "check", recipe, "--sockets", sockets)
         assert run.code == ExitCode.USAGE
-        assert said in run.err
+        assert reported in run.err
     missing = 'interface = "socketcan"\nserial_number = "none-like-this"\n'
     sockets.write_text(f'[[socket]]\nname = "A"\n{missing}', "utf-8")
     run = flasher("station", "check", recipe, "--sockets", sockets)
@@ -297,8 +297,8 @@ def test_a_label_that_waits_when_the_pipe_has_ended_is_dropped(
     run = flasher("station", "run", *words, "--lines")
     assert time.perf_counter() - began < 20.0, "it would be forgotten after two minutes"
     assert run.code == ExitCode.PARTIAL
-    told = "SCANS_ENDED: W2605002: The scans have ended. Scan it again when the station runs."
-    assert f"refused {told}" in run.out
+    printed = "SCANS_ENDED: W2605002: The scans have ended. Scan it again when the station runs."
+    assert f"refused {printed}" in run.out
     assert "refused  W2605002: SCANS_ENDED" in run.out
 
 
@@ -327,11 +327,11 @@ def test_sockets_that_can_never_work_end_the_station(
     flasher: Flasher, recipe: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Broken(ThreadPort):
-        said = False
+        reported = False
 
         def receive(self) -> Any:
-            if not self.said:
-                self.said = True
+            if not self.reported:
+                self.reported = True
                 return AdapterDown("The recipe was changed.", is_final=True)
             raise EOFError
 
@@ -342,7 +342,7 @@ def test_sockets_that_can_never_work_end_the_station(
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "reported"),
     [
         ((), "either a station file or virtual sockets"),
         (("--mock-sockets", "65"), "1 to 64 sockets"),
@@ -363,7 +363,7 @@ def test_wrong_usage_states_what_is_wrong(
     recipe: Path,
     monkeypatch: pytest.MonkeyPatch,
     words: tuple[str, ...],
-    said: str,
+    reported: str,
 ) -> None:
     monkeypatch.chdir(recipe.parent)
     Path("scans.txt").write_text("W2605002\n", "utf-8")
@@ -380,7 +380,7 @@ def test_wrong_usage_states_what_is_wrong(
     )
     run = flasher("station", "run", "--recipe", recipe, *words)
     assert run.code == ExitCode.USAGE
-    assert said in run.err
+    assert reported in run.err
     assert "Traceback" not in run.err
 
 
@@ -594,15 +594,15 @@ def test_a_changed_attachment_is_found(
     run = flasher("station", "verify", "--database", copy)
     assert run.code == ExitCode.VERIFICATION
     assert "its hash differs" in run.out
-    told = flasher("station", "verify", "--database", copy, "--json")
-    hold(schema, "document.station", told.document)
+    printed = flasher("station", "verify", "--database", copy, "--json")
+    hold(schema, "document.station", printed.document)
     unit = flasher("station", "unit", SERIAL, "--database", copy)
     assert unit.code == ExitCode.OK
     assert "its hash differs" in unit.out
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "reported"),
     [
         (("unit", "W0000000"), "no unit W0000000"),
         (("report", "--database", "none.sqlite"), "no records"),
@@ -610,12 +610,12 @@ def test_a_changed_attachment_is_found(
     ],
 )
 def test_what_is_not_there_is_reported(
-    flasher: Flasher, plant: Path, words: tuple[str, ...], said: str
+    flasher: Flasher, plant: Path, words: tuple[str, ...], reported: str
 ) -> None:
     database = () if "--database" in words else ("--database", str(plant))
     run = flasher("station", *words, *database)
     assert run.code == ExitCode.USAGE
-    assert said in run.err
+    assert reported in run.err
 
 
 def test_an_action_has_to_be_named() -> None:
@@ -722,7 +722,7 @@ def test_virtual_units_stay_out_of_records_of_real_ones(flasher: Flasher, tmp_pa
     assert asked.code == ExitCode.OK
     (unit,) = lines_of(asked)[1]["units"]
     assert unit["is_virtual"]
-    told = flasher("station", "unit", unit["serial"], "--database", bench.path)
-    assert "PASS, a VIRTUAL unit, no product" in told.out
+    printed = flasher("station", "unit", unit["serial"], "--database", bench.path)
+    assert "PASS, a VIRTUAL unit, no product" in printed.out
     report = flasher("station", "report", "--database", bench.path)
     assert "VIRTUAL:  1 run of virtual units, no products" in report.out

@@ -54,9 +54,9 @@ def test_verify_states_what_the_records_were_compared_with(
         "  line-2: heads are stored only beside the key",
         "  1 trace of runs that passed agree with the records",
     ]
-    told = flasher("station", "verify", *place, "--json")
-    hold_output(schema, told.out, 0)
-    assert not told.document["is_checked_elsewhere"]
+    printed = flasher("station", "verify", *place, "--json")
+    hold_output(schema, printed.out, 0)
+    assert not printed.document["is_checked_elsewhere"]
     shutil.copytree(bench.keys, bench.folder / "share", ignore=shutil.ignore_patterns("*.key"))
     again = flasher("station", "verify", *place)
     assert again.out.startswith("no difference in the records since the examination of ")

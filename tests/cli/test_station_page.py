@@ -266,10 +266,10 @@ def test_who_signs_in_at_a_page_is_in_the_audit_trail(
     assert answers == [(403, ""), (303, "/runs"), (1, ""), (303, "/")]
     with closing(sqlite3.connect(tmp_path / "records.sqlite")) as connection:
         rows = connection.execute("SELECT event, data FROM audit ORDER BY id").fetchall()
-    told = [(event, json.loads(data)) for event, data in rows if "sign" in event]
+    printed = [(event, json.loads(data)) for event, data in rows if "sign" in event]
     address = {"address": "127.0.0.1"}
     sue = {"number": "1", "name": "Sue", **address}
-    assert told == [
+    assert printed == [
         ("refused sign-in", {"name": "", "why": "unknown badge", **address}),
         ("sign-in", {**sue, "role": "supervisor"}),
         ("sign-out", sue),

@@ -50,7 +50,7 @@ def test_records_are_served_until_ctrl_c(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "reported"),
     [
         (
             ("--database", "nothing.sqlite"),
@@ -61,10 +61,10 @@ def test_records_are_served_until_ctrl_c(tmp_path: Path) -> None:
     ],
 )
 def test_what_cannot_be_served_is_reported(
-    flasher: Flasher, tmp_path: Path, options: tuple[str, ...], said: str
+    flasher: Flasher, tmp_path: Path, options: tuple[str, ...], reported: str
 ) -> None:
     bench = Bench(tmp_path)
     bench.store.close()
     run = flasher("station", "pages", "--database", bench.path, *options)
     assert run.code == 2
-    assert said in run.err
+    assert reported in run.err

@@ -58,15 +58,15 @@ def test_the_first_signal_asks_and_the_second_interrupts(number: signal.Signals)
 
 def test_the_user_is_informed_once_and_not_from_within_the_handler() -> None:
     """A handler may interrupt a print; another print in it would fail."""
-    told: list[str] = []
-    with stop_on_signal(lambda: told.append("stopping")) as stopped:
+    printed: list[str] = []
+    with stop_on_signal(lambda: printed.append("stopping")) as stopped:
         stopped()
-        assert told == []
+        assert printed == []
         signal.raise_signal(signal.SIGINT)
-        assert told == []
+        assert printed == []
         assert stopped()
         assert stopped()
-        assert told == ["stopping"]
+        assert printed == ["stopping"]
 
 
 def test_the_handlers_from_before_are_back_afterwards_whatever_happened() -> None:
@@ -214,11 +214,11 @@ def flashing(
 
 def seconds_until_the_end(process: subprocess.Popen[str]) -> tuple[float, str]:
     began = time.perf_counter()
-    _, said = process.communicate()
-    return time.perf_counter() - began, said
+    _, reported = process.communicate()
+    return time.perf_counter() - began, reported
 
 
-def told(process: subprocess.Popen[str]) -> Callable[[str], list[str]]:
+def printed(process: subprocess.Popen[str]) -> Callable[[str], list[str]]:
     def wait_for(wanted: str) -> list[str]:
         assert process.stderr is not None
         return lines_until(process.stderr, wanted)
@@ -232,16 +232,18 @@ def test_a_signal_in_the_transfer_ends_it_cleanly_and_states_what_to_do(
     tmp_path: Path, number: signal.Signals
 ) -> None:
     with flashing(tmp_path) as process:
-        told(process)("transferring ...")
+        printed(process)("transferring ...")
         process.send_signal(number)
-        took_s, said = seconds_until_the_end(process)
+        took_s, reported = seconds_until_the_end(process)
     assert process.returncode == ExitCode.INTERRUPTED
     assert took_s < 2.0
-    assert "stopping at the end of the message ..." in said
-    assert "cancelled by the user" in said
-    assert "Run the same command again" in said
-    assert "State of the device: its application is erased, half written or not accepted" in said
-    assert "Traceback" not in said
+    assert "stopping at the end of the message ..." in reported
+    assert "cancelled by the user" in reported
+    assert "Run the same command again" in reported
+    assert (
+        "State of the device: its application is erased, half written or not accepted" in reported
+    )
+    assert "Traceback" not in reported
 
 
 @signals_reach_processes
@@ -254,10 +256,10 @@ def test_ctrl_c_ends_in_no_time_at_any_setting(tmp_path: Path, options: tuple[st
     """
     for _ in range(3):
         with flashing(tmp_path, *options, command="rescue") as process:
-            told(process)("transferring ...")
+            printed(process)("transferring ...")
             process.send_signal(signal.SIGINT)
             began = time.perf_counter()
-            told(process)("cancelled by the user")
+            printed(process)("cancelled by the user")
             took_s = time.perf_counter() - began
         if took_s < 1.0:
             return
@@ -282,9 +284,9 @@ def test_a_closed_terminal_ends_before_the_update_command_and_finishes_after_it(
     pid, terminal = pty.fork()
     if pid == 0:
         os.execve(FLASHER[0], [*FLASHER, "flash", image, *words], clean_environment())  # noqa: S606
-    said = b""
-    while phase.encode() not in said:
-        said += os.read(terminal, 4096)
+    reported = b""
+    while phase.encode() not in reported:
+        reported += os.read(terminal, 4096)
     os.close(terminal)
     _, status = os.waitpid(pid, 0)
     assert os.waitstatus_to_exitcode(status) == code

@@ -95,7 +95,7 @@ def test_no_encoding_of_a_stream_ends_a_command(
         f"({number / 10:.6f}) can0 {frame.can_id:03X}#{frame.data.hex()} R\n"
         for number, frame in enumerate((*traffic.running(), *traffic.faults(b"\xff" * 4)))
     ))  # fmt: skip
-    said = {}
+    reported = {}
     for name, words in COMMANDS.items():
         streams = [io.TextIOWrapper(io.BytesIO(), encoding=encoding) for _ in range(2)]
         monkeypatch.setattr(sys, "stdout", streams[0])
@@ -104,10 +104,10 @@ def test_no_encoding_of_a_stream_ends_a_command(
         raw = [bytes(stream.buffer.getvalue()) for stream in streams]
         assert code != ExitCode.INTERNAL, (name, raw)
         assert b"Traceback" not in raw[1], (name, raw)
-        said[name] = raw[0].decode(encoding)
+        reported[name] = raw[0].decode(encoding)
     degree = "deg" if encoding == "ascii" else "°"
     for name in ("info", "read", "lines"):
-        assert f"{degree}C" in said[name], said[name]
+        assert f"{degree}C" in reported[name], reported[name]
 
 
 def test_json_alone_is_answered_in_json(flasher: Flasher) -> None:

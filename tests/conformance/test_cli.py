@@ -214,8 +214,8 @@ def test_all_files_are_written_with_what_they_are_for(flasher: Flasher, tmp_path
     (trace,) = (tmp_path / "new" / "traces").iterdir()
     assert trace.name == "RS-01.log"
     assert document["results"][0]["trace_file"] == "RS-01.log"
-    told = flasher("explain", trace)
-    assert told.code == 0
+    printed = flasher("explain", trace)
+    assert printed.code == 0
     assert "boot version" in flasher("explain", trace, "--all").out
 
 
@@ -270,7 +270,7 @@ def test_cases_that_failed_are_selected_by_the_report_alone(
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "said"),
+    ("words", "code", "reported"),
     [
         ((), 2, "-t/--target is required"),
         (("-t", "bms", "--mock", "--matrix", "clauses.pdf"), 2, "ends in .csv or .html"),
@@ -293,11 +293,11 @@ def test_cases_that_failed_are_selected_by_the_report_alone(
     ],
 )
 def test_wrong_usage_is_reported_before_anything_is_done(
-    flasher: Flasher, words: tuple[str, ...], code: int, said: str
+    flasher: Flasher, words: tuple[str, ...], code: int, reported: str
 ) -> None:
     run = flasher("conformance", *words)
     assert run.code == code
-    assert said in run.err
+    assert reported in run.err
     assert "Traceback" not in run.err
     assert run.out == ""
 

@@ -100,7 +100,7 @@ def test_a_crc_that_nothing_fits_is_shown_with_the_right_one() -> None:
 
 
 @pytest.mark.parametrize(
-    ("raw", "said"),
+    ("raw", "reported"),
     [
         ("AA550C0BC109424D5356312E302E30F0", "begin with AA 55"),
         ("55AA0C0BC109424D5356312E302E300BD4B7F60D", "end with 0D"),
@@ -109,8 +109,8 @@ def test_a_crc_that_nothing_fits_is_shown_with_the_right_one() -> None:
         ("0102", "incomplete messages: the first one is 01 02"),
     ],
 )
-def test_another_form_of_the_messages_is_named(raw: str, said: str) -> None:
-    assert said in _diagnosis(*_message(bytes.fromhex(raw)))
+def test_another_form_of_the_messages_is_named(raw: str, reported: str) -> None:
+    assert reported in _diagnosis(*_message(bytes.fromhex(raw)))
 
 
 def test_the_name_of_another_device() -> None:

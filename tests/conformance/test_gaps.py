@@ -65,8 +65,10 @@ def check_bare_bench(target: str, address: int, cases: Sequence[str]) -> None:
     selection = Selection(cases=(*cases, "BU-07"))
     report = run(subject, profile, selection=selection, options=SuiteOptions(upgrades=4))
     assert report.gaps == foreseen
-    is_told = target == "bms" and address
-    assert is_told != any(gap.requirement == Requirement.IMAGE_READBACK.value for gap in foreseen)
+    is_printed = target == "bms" and address
+    assert is_printed != any(
+        gap.requirement == Requirement.IMAGE_READBACK.value for gap in foreseen
+    )
     verdicts = {result.case_id: result.verdict for result in report.results}
     unsupported = {case_id for gap in foreseen for case_id in gap.unsupported}
     in_part = {case_id for gap in foreseen for case_id in gap.in_part}

@@ -137,11 +137,11 @@ class Confirming(MockDevice):
         super()._take_row(row, now)
 
     def _acknowledge(self, now: float) -> str:
-        said = super()._acknowledge(now)
+        reported = super()._acknowledge(now)
         self.acks += 1
         if self.acks == 100:
             self._transmitter.drop_unstarted()
-        return said
+        return reported
 
 
 class Witness(MockDevice):

@@ -71,7 +71,7 @@ def test_a_written_default_profile_gives_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "reported"),
     [
         ("tx_01_lost = 'nak'", "Did you mean tx_01_lost_frame?"),
         ("[limits]\nerase = 1", "Did you mean erase_s?"),
@@ -89,10 +89,12 @@ def test_a_written_default_profile_gives_nothing(tmp_path: Path) -> None:
         ("tx_02 = ", "TOML"),
     ],
 )
-def test_what_is_not_allowed_is_refused_with_its_key(tmp_path: Path, text: str, said: str) -> None:
+def test_what_is_not_allowed_is_refused_with_its_key(
+    tmp_path: Path, text: str, reported: str
+) -> None:
     with pytest.raises(UsageError) as raised:
         load_profile(write(tmp_path, text))
-    assert said in str(raised.value)
+    assert reported in str(raised.value)
 
 
 def test_a_file_that_is_not_there_is_a_mistake_of_the_user(tmp_path: Path) -> None:

@@ -158,22 +158,22 @@ def test_what_a_link_cannot_send_is_unsupported() -> None:
             action()
 
 
-@pytest.mark.parametrize(("on", "said"), [(True, "on"), (False, "off")])
-def test_the_power_command_gets_on_or_off(tmp_path: Path, on: bool, said: str) -> None:
+@pytest.mark.parametrize(("on", "reported"), [(True, "on"), (False, "off")])
+def test_the_power_command_gets_on_or_off(tmp_path: Path, on: bool, reported: str) -> None:
     path = tmp_path / "said"
     DevicePowerCommand(f'{sys.executable} -c "{SCRIPT}" {path} {{on|off}}')(on)
-    assert path.read_text() == said
+    assert path.read_text() == reported
 
 
 @each(
-    "command, said",
+    "command, reported",
     [
         ("no-such-relay {on|off}", "cannot be run"),
         (f'{sys.executable} -c "raise SystemExit(3)" {{on|off}}', "exit code 3"),
     ],
 )
-def test_a_power_command_that_fails_is_an_error_of_the_bench(command: str, said: str) -> None:
-    with pytest.raises(BusError, match=said):
+def test_a_power_command_that_fails_is_an_error_of_the_bench(command: str, reported: str) -> None:
+    with pytest.raises(BusError, match=reported):
         DevicePowerCommand(command)(True)
 
 

@@ -118,7 +118,7 @@ def test_a_part_that_the_bench_cannot_do_is_reported_and_the_rest_judged() -> No
         passes(bench)
         raise Unsupported("no tool")
 
-    def only_said(bench: Bench) -> None:
+    def only_sent(bench: Bench) -> None:
         bench.unsupported("a thing", "no tool")
 
     report = run_case(partly)
@@ -131,7 +131,7 @@ def test_a_part_that_the_bench_cannot_do_is_reported_and_the_rest_judged() -> No
     (remark,) = strict.remarks()
     assert "strict" in remark
     assert status_of(not_to_its_end) is CaseVerdict.PASS_IN_PART
-    assert status_of(only_said) is CaseVerdict.UNSUPPORTED
+    assert status_of(only_sent) is CaseVerdict.UNSUPPORTED
 
 
 @pytest.mark.slow
@@ -244,16 +244,18 @@ def test_a_quick_run_leaves_out_what_is_long_unless_it_is_named() -> None:
 
 
 @each(
-    "selection, said",
+    "selection, reported",
     [
         (Selection(cases=("RS-1",)), "Did you mean RS-0"),
         (Selection(groups=("XX",)), "There is no group"),
     ],
 )
-def test_a_case_or_group_that_does_not_exist_is_refused(selection: Selection, said: str) -> None:
+def test_a_case_or_group_that_does_not_exist_is_refused(
+    selection: Selection, reported: str
+) -> None:
     with pytest.raises(UsageError) as raised:
         run(subject(), PROFILE, selection=selection)
-    assert said in str(raised.value)
+    assert reported in str(raised.value)
 
 
 # -- the known state ------------------------------------------------------------------------------

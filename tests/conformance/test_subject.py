@@ -262,7 +262,7 @@ def test_no_process_is_left() -> None:
 
 
 @pytest.mark.parametrize(
-    ("subject", "said"),
+    ("subject", "stated"),
     [
         ("missing", "There is no bootloader missing"),
         ("nowhere:make", "No module named 'nowhere'"),
@@ -277,10 +277,10 @@ def test_no_process_is_left() -> None:
         (shutil.which("true") or "", "ended with status 0 in flasher_dut_about"),
     ],
 )
-def test_what_is_no_bootloader_is_reported_at_once(subject: str, said: str) -> None:
+def test_what_is_no_bootloader_is_reported_at_once(subject: str, stated: str) -> None:
     with pytest.raises(UsageError) as raised:
         _run(subject, "RS-01")
-    assert said in f"{raised.value} {raised.value.cause}"
+    assert stated in f"{raised.value} {raised.value.cause}"
     assert "Traceback" not in raised.value.cause
 
 
@@ -336,21 +336,21 @@ def test_what_is_written_to_the_pipe_and_is_no_message_is_reported(tmp_path: Pat
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
 @pytest.mark.parametrize(
-    ("code", "said"),
+    ("code", "stated"),
     [
         ("int another;", "undefined symbol: flasher_dut_about"),
         (_NULL, "flasher_dut_about returns NULL"),
     ],
 )
 def test_a_library_in_the_working_directory_states_what_it_lacks(
-    code: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    code: str, stated: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("boot.c").write_text(code)
     subprocess.run(["cc", "-shared", "-fPIC", "boot.c", "-o", "boot.so"], check=True)
     with pytest.raises(UsageError) as raised:
         _run("boot.so", "RS-01")
-    assert raised.value.cause.endswith(said)
+    assert raised.value.cause.endswith(stated)
 
 
 def test_a_program_of_another_version_of_the_header_is_refused(tmp_path: Path) -> None:

@@ -30,11 +30,11 @@ class TiredDevice(MockDevice):
         return super()._erase(now)
 
     def _acknowledge(self, now: float) -> str:
-        said = super()._acknowledge(now)
+        reported = super()._acknowledge(now)
         # The first upgrade is the suite's own, before the case.
         if self.erasures in (5, 9) and self._transfer.stored == 3:
             self._transmitter.drop_unstarted()
-        return said
+        return reported
 
 
 def worn(

@@ -28,7 +28,7 @@ def listen(payloads: str, can_id: int = 0x725, gap_s: float = 0.001) -> list[Rec
     ]
 
 
-def said(frames: list[RawFrame]) -> str:
+def reported(frames: list[RawFrame]) -> str:
     return " ".join(frame.data.hex().upper() for frame in frames)
 
 
@@ -61,9 +61,9 @@ def test_the_crc_is_that_of_the_documents_example() -> None:
 )
 def test_what_the_tool_sends_is_byte_exact(target: str, reset: str, update: str, end: str) -> None:
     words = Encoder(target)
-    assert said(words.reset()) == reset
-    assert said(words.update(78351)) == update
-    assert said(words.end()) == end
+    assert reported(words.reset()) == reset
+    assert reported(words.update(78351)) == update
+    assert reported(words.end()) == end
 
 
 def test_a_packet_is_18_whole_frames() -> None:
@@ -133,12 +133,12 @@ def test_a_message_that_stops_midway_is_damaged_once_another_begins() -> None:
 )
 def test_what_counts_depends_on_the_id(can_id: int, command: int, kinds: list[Reply]) -> None:
     message = split(can_id, build(can_id, wire.REPORT, command, b"\1\0"))
-    assert [reply.kind for reply in listen(said(message), can_id=can_id)] == kinds
+    assert [reply.kind for reply in listen(reported(message), can_id=can_id)] == kinds
 
 
 def test_an_answer_with_other_data_is_another_message() -> None:
     request = split(0x725, build(0x725, wire.REPORT, wire.REQUEST, b"\0\1"))
-    assert [reply.kind for reply in listen(said(request))] == [Reply.OTHER]
+    assert [reply.kind for reply in listen(reported(request))] == [Reply.OTHER]
 
 
 def test_frames_that_are_no_payload_are_nothing() -> None:

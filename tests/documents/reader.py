@@ -95,7 +95,7 @@ class PageReader:
             if line != "echo $?" and not is_asked:
                 assert self._code == code, f"{line}: exit code {self._code}\n{output[-2000:]}"
             if block.language == "console":
-                assert is_told(expected, output), (
+                assert is_printed(expected, output), (
                     f"{line}\n\n{expected}\nis not\n\n{output[-4000:]}"
                 )
 
@@ -115,11 +115,11 @@ class PageReader:
         line, _, behind = line.partition(" | ")
         line, _, target = line.partition(" > ")
         is_whole = not (behind or target or line.endswith(_SILENT))
-        told = self._flasher(line.removesuffix(_SILENT), is_whole=is_whole)
+        printed = self._flasher(line.removesuffix(_SILENT), is_whole=is_whole)
         if target:
-            (self._folder / target).write_text(told, encoding="utf-8")
+            (self._folder / target).write_text(printed, encoding="utf-8")
             return ""
-        return self._shell(behind, told) if behind else told
+        return self._shell(behind, printed) if behind else printed
 
     def _shell(self, line: str, given: str) -> str:
         ended = subprocess.run(
@@ -181,10 +181,14 @@ def commands(block: Block) -> list[str]:
 
 def hold_options(line: str) -> None:
     """Fails for a command or an option that there is not. Nothing is run."""
-    said = _stream()
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(said), redirect_stderr(said):
+    reported = _stream()
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        redirect_stdout(reported),
+        redirect_stderr(reported),
+    ):
         patch.setattr(click.Context, "invoke", lambda *_words, **_options: 0)
-        assert main(shlex.split(line, comments=True)[1:]) == 0, _text(said)
+        assert main(shlex.split(line, comments=True)[1:]) == 0, _text(reported)
 
 
 def has_option(words: list[str], name: str) -> bool:
@@ -198,7 +202,7 @@ def has_option(words: list[str], name: str) -> bool:
     return command is not None and any(name in param.opts for param in command.params)
 
 
-def is_told(expected: str, output: str) -> bool:
+def is_printed(expected: str, output: str) -> bool:
     """Whether an output is what the page shows: `...` is anything, times are not compared."""
     parts = [re.escape(part) for part in re.split(r" ?\.\.\. ?", _plain(expected))]
     return re.fullmatch(".*".join(parts), _plain(output), re.DOTALL) is not None

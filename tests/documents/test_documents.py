@@ -11,7 +11,7 @@ import pytest
 from flasher.bus.detect import DetectionResult
 from flasher.bus.link import VirtualClock
 from tests.documents.blocks import LANGUAGES, ROOT, Block, blocks, pages
-from tests.documents.reader import PageReader, hold_options, is_told
+from tests.documents.reader import PageReader, hold_options, is_printed
 from tests.terminal_picture import COMMAND, PICTURE
 
 pytestmark = pytest.mark.slow
@@ -82,8 +82,8 @@ def test_a_wrong_option_a_wrong_output_and_a_wrong_code_are_found(tmp_path: Path
 
 
 def test_dots_stand_for_anything_and_times_are_not_compared() -> None:
-    assert is_told("a\n...\nc 1.5 s", "a\nb\nb\nc  22 s\n")
-    assert not is_told("a\n...\nc 15 packets", "a\nb\nc 16 packets\n")
+    assert is_printed("a\n...\nc 1.5 s", "a\nb\nb\nc  22 s\n")
+    assert not is_printed("a\n...\nc 15 packets", "a\nb\nc 16 packets\n")
 
 
 def test_a_block_has_the_marks_above_it() -> None:

@@ -85,15 +85,15 @@ class Forked:
             self.end()
 
     @property
-    def said(self) -> str:
+    def reported(self) -> str:
         """All that it has printed so far."""
         return self.stdout + self.stderr
 
     def until(self, words: str) -> None:
         """Wait until it has printed these words. Fails when it ends before."""
-        while words not in self.said:
+        while words not in self.reported:
             if not self._read():
-                raise AssertionError(f"{words!r} never came; what came: {self.said}")
+                raise AssertionError(f"{words!r} never came; what came: {self.reported}")
 
     def signal(self, number: signal.Signals) -> None:
         """Send it a signal."""

@@ -64,7 +64,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 done = bus.flasher(
                     "flash", "image.bin", "-t", "bms", "--trace-file", "own.log", folder=folder
                 )
-            assert done.end() == ExitCode.OK, done.said
+            assert done.end() == ExitCode.OK, done.reported
             time.sleep(6.0)  # python-can's logger writes after a quarter of a second without frames
         finally:
             for listener in listeners:
@@ -94,17 +94,17 @@ def frames(path: Path) -> dict[int, list[bytes]]:
 def story(name: str, folder: Path) -> dict[str, Any]:
     """What `flasher explain` makes of it."""
     done = run("explain", "--json", name, folder=folder)
-    assert done.end() == ExitCode.OK, done.said
-    told = json.loads(done.stdout)["story"]
-    assert isinstance(told, dict)
-    return told
+    assert done.end() == ExitCode.OK, done.reported
+    printed = json.loads(done.stdout)["story"]
+    assert isinstance(printed, dict)
+    return printed
 
 
-def words_of(told: dict[str, Any]) -> tuple[object, ...]:
+def words_of(printed: dict[str, Any]) -> tuple[object, ...]:
     """What is said of an upgrade, without its times."""
-    upgrade = told["upgrades"][0]
+    upgrade = printed["upgrades"][0]
     return (
-        told["verdict"]["cause"],
+        printed["verdict"]["cause"],
         [(packet["number"], packet["tries"], packet["naks"]) for packet in upgrade["packets"]],
         [phase["phase"] for phase in upgrade["phases"]],
     )
@@ -180,7 +180,7 @@ def test_tshark_names_the_messages_by_the_dissector(folder: Path, name: str) -> 
 def test_cantools_decodes_the_joined_messages(folder: Path) -> None:
     run("export", "dbc", "-o", "welling.dbc", folder=folder)
     run("export", "trace", "candump.log", "--joined", "-o", "joined.log", folder=folder)
-    told = root(f"cd {folder} && {sys.executable} -m cantools decode welling.dbc < joined.log")
+    printed = root(f"cd {folder} && {sys.executable} -m cantools decode welling.dbc < joined.log")
     packets = -(-SIZE_BYTES // 128)
-    assert told.count("command: packet") == told.count("command: ACK") == packets
-    assert "update_command_size_bytes: 6000 B" in told
+    assert printed.count("command: packet") == printed.count("command: ACK") == packets
+    assert "update_command_size_bytes: 6000 B" in printed

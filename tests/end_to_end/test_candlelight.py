@@ -63,7 +63,7 @@ def check_flash(bus: Candlelights, folder: Path, *arguments: str) -> Forked:
     """A flash that has to succeed, and that the device stored."""
     (folder / "out.bin").unlink(missing_ok=True)
     done = bus.flasher("flash", "image.bin", "-t", "bms", *arguments, folder=folder)
-    assert done.end() == ExitCode.OK, done.said
+    assert done.end() == ExitCode.OK, done.reported
     assert (folder / "out.bin").read_bytes() == IMAGE
     return done
 
@@ -74,8 +74,8 @@ def check_flash(bus: Candlelights, folder: Path, *arguments: str) -> Forked:
 @pytest.mark.usefixtures("device")
 def test_a_flash_uses_most_of_the_line(bus: Candlelights, tmp_path: Path) -> None:
     done = check_flash(bus, tmp_path)
-    share = re.search(r"(\d+)% of a 250 kbit/s line", done.said)
-    assert share is not None, done.said
+    share = re.search(r"(\d+)% of a 250 kbit/s line", done.reported)
+    assert share is not None, done.reported
     figure(f"{share[0]}")
     assert int(share[1]) > 40
 
@@ -92,7 +92,7 @@ def test_an_adapter_that_is_put_back_in_a_transfer_goes_on(
         bus.unplug(0)
         bus.plug(0)
         start(bus.tool)
-        assert host.end() == ExitCode.OK, host.said
+        assert host.end() == ExitCode.OK, host.reported
     assert (tmp_path / "out.bin").read_bytes() == IMAGE
     assert "error: can." not in host.stderr, "python-can's own line is no error of this command"
 
@@ -103,9 +103,9 @@ def test_an_adapter_that_stays_away_ends_the_flash_and_the_same_command_brings_t
 ) -> None:
     with flashing(bus, tmp_path) as host:
         bus.unplug(0)
-        assert host.end() == ExitCode.BUS, host.said
+        assert host.end() == ExitCode.BUS, host.reported
     assert "State of the device: its application is erased" in host.stderr
-    assert "Traceback" not in host.said
+    assert "Traceback" not in host.reported
     assert "error: can." not in host.stderr
     bus.plug(0)
     start(bus.tool)
@@ -144,7 +144,7 @@ def test_bus_off_in_a_transfer_ends_it_as_bus_off(bus: Candlelights, tmp_path: P
     """BU-02."""
     with flashing(bus, tmp_path) as host:
         bus.short(300)
-        assert host.end() == ExitCode.BUS, host.said
+        assert host.end() == ExitCode.BUS, host.reported
     assert "[E406]" in host.stderr
     assert "its application is erased" in host.stderr
     start(bus.device)
@@ -163,7 +163,7 @@ def test_bus_off_that_somebody_ends_in_time_does_not_end_a_transfer(
         bus.short(0)
         start(bus.device)
         start(bus.tool)
-        assert host.end() == ExitCode.OK, host.said
+        assert host.end() == ExitCode.OK, host.reported
     assert (tmp_path / "out.bin").read_bytes() == IMAGE
 
 
@@ -181,7 +181,7 @@ def test_no_node_acknowledges(bus: Candlelights, tmp_path: Path) -> None:
 def test_a_device_at_another_bit_rate(bus: Candlelights, tmp_path: Path) -> None:
     start(bus.device, bitrate_bps=500_000)
     done = bus.flasher("flash", "image.bin", "-t", "bms", folder=tmp_path)
-    assert done.end() == ExitCode.BUS, done.said
+    assert done.end() == ExitCode.BUS, done.reported
     assert "erased nothing" in done.stderr
 
 
@@ -200,9 +200,9 @@ def test_an_interface_that_only_listens_is_refused_for_sending_and_not_for_liste
 ) -> None:
     start(bus.tool, "listen-only on")
     done = bus.flasher("flash", "image.bin", "-t", "bms", folder=tmp_path)
-    assert done.end() == ExitCode.BUS, done.said
+    assert done.end() == ExitCode.BUS, done.reported
     assert "only listens" in done.stderr
-    assert "resetting" not in done.said
+    assert "resetting" not in done.reported
     looked = bus.flasher("doctor", folder=tmp_path)
     assert looked.end() == ExitCode.BUS
     assert "listens without acknowledging" in looked.stdout
@@ -224,8 +224,8 @@ def test_a_flash_beside_noise(
     noise = f"cangen {bus.device} -I {can_id} -L 8 -D r -g {gap_ms} -p 10"
     with background(noise):
         check_flash(bus, tmp_path, "--trace-file", "noise.log")
-    told = run("explain", "--json", "noise.log", folder=tmp_path)
-    seen = json.loads(told.stdout)["story"]["bus"]["load"]
+    printed = run("explain", "--json", "noise.log", folder=tmp_path)
+    seen = json.loads(printed.stdout)["story"]["bus"]["load"]
     figure(f"bus load: {seen:.0%}")
     assert seen > load
 
@@ -292,7 +292,7 @@ def test_a_second_tool_is_refused_from_the_wire_and_from_the_same_interface(
     """CO-03."""
     with background(f"cangen {getattr(bus, where)} -I 752 -L 8 -D r -g 5"):
         done = bus.flasher("flash", "image.bin", "-t", "bms", folder=tmp_path)
-        assert done.end() == ExitCode.BUS, done.said
+        assert done.end() == ExitCode.BUS, done.reported
     assert "[E407]" in done.stderr
     assert "erased nothing" in done.stderr
     check_flash(bus, tmp_path)

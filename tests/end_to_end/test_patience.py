@@ -37,8 +37,8 @@ def test_a_device_alone_on_the_bus_that_loses_its_power_is_finished_when_it_is_b
     result = stage.flash()
     assert result.exit_code == ExitCode.OK
     assert stage.has == IMAGE.data
-    told = stage.seen(events.BusBlocked)
-    assert ["took no frame" in each.reason and each.limit_s > 60.0 for each in told] == [True]
+    printed = stage.seen(events.BusBlocked)
+    assert ["took no frame" in each.reason and each.limit_s > 60.0 for each in printed] == [True]
 
 
 def test_a_bus_that_stays_blocked_ends_it_at_the_overall_deadline() -> None:

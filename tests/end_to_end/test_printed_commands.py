@@ -68,16 +68,16 @@ class Reader:
             return None
         words += HOW_IT_ENDS.get(words[1], "").split()
         ran = run(*words[1:], folder=self._folder)
-        assert ran.end() == code, f"{command}: {ran.said}"
+        assert ran.end() == code, f"{command}: {ran.reported}"
         return ran
 
     def obeys(self, done: Forked, *, but: dict[str, int] | None = None) -> list[str]:
         """All commands that were printed; `but` are exit codes of commands that begin so. What is
         only mentioned has to exist.
         """
-        for name in sorted({*NAMED.findall(done.said)} - NO_COMMAND):
+        for name in sorted({*NAMED.findall(done.reported)} - NO_COMMAND):
             self.types(f"flasher {name} --help")
-        printed = commands_in(done.said)
+        printed = commands_in(done.reported)
         for command in printed:
             codes = [code for begin, code in (but or {}).items() if command.startswith(begin)]
             self.types(command, codes[0] if codes else OK)
@@ -117,9 +117,9 @@ FLASH = ("flash", "image.bin", "-t", "bms", "--frame-gap", "0.002")
 def check_good(bus: Pair, tmp_path: Path) -> None:
     """What was printed has helped: doctor finds no problem, and a flash succeeds."""
     looked = bus.flasher("doctor", folder=tmp_path)
-    assert looked.end() == OK, looked.said
+    assert looked.end() == OK, looked.reported
     done = bus.flasher(*FLASH, folder=tmp_path)
-    assert done.end() == OK, done.said
+    assert done.end() == OK, done.reported
 
 
 # -- interfaces that are set up wrongly ------------------------------------------------------------
@@ -164,8 +164,8 @@ def test_what_flash_prints_helps(
 ) -> None:
     spoil(bus)
     done = bus.flasher(*FLASH, folder=tmp_path)
-    assert done.end() == BUS, done.said
-    assert reader.obeys(done), done.said
+    assert done.end() == BUS, done.reported
+    assert reader.obeys(done), done.reported
     check_good(bus, tmp_path)
 
 
@@ -176,12 +176,14 @@ def test_what_doctor_prints_helps(
 ) -> None:
     spoil(bus)
     done = bus.flasher("doctor", folder=tmp_path)
-    assert (done.end() == OK) == (spoil is one_shot), done.said
+    assert (done.end() == OK) == (spoil is one_shot), done.reported
     printed = reader.obeys(done)
-    assert any(command.startswith("ip link set") for command in printed), done.said
+    assert any(command.startswith("ip link set") for command in printed), done.reported
     check_good(bus, tmp_path)
     again = bus.flasher("doctor", folder=tmp_path)
-    assert not any(command.startswith("ip") for command in commands_in(again.said)), again.said
+    assert not any(command.startswith("ip") for command in commands_in(again.reported)), (
+        again.reported
+    )
 
 
 @pytest.mark.usefixtures("device")
@@ -210,8 +212,8 @@ def test_bus_off_ends_by_what_is_printed(reader: Reader, tmp_path: Path, command
         bus.leave_bus()
         arguments = {"flash": FLASH, "doctor": ("doctor",), "info": ("info", "-t", "bms")}[command]
         done = bus.flasher(*arguments, folder=tmp_path)
-        assert done.end() == BUS, done.said
-        assert any(each.startswith("ip link set") for each in reader.obeys(done)), done.said
+        assert done.end() == BUS, done.reported
+        assert any(each.startswith("ip link set") for each in reader.obeys(done)), done.reported
         check_good(bus, tmp_path)
 
 
@@ -228,10 +230,10 @@ def test_what_is_printed_after_a_lost_adapter_finishes_the_upgrade(
         with Forked(*FLASH, *on(bus.tool), folder=tmp_path) as host:
             host.until("transferring ...")
             bus.unplug(0)
-            assert host.end() == BUS, host.said
+            assert host.end() == BUS, host.reported
         bus.plug(0)
         printed = reader.obeys(host)
-        assert any(command.startswith("flasher") for command in printed), host.said
+        assert any(command.startswith("flasher") for command in printed), host.reported
         assert (tmp_path / "out.bin").read_bytes() == (tmp_path / "image.bin").read_bytes()
 
 
@@ -255,7 +257,7 @@ def test_what_doctor_prints_on_a_full_bus_succeeds(reader: Reader, tmp_path: Pat
     with background(f"cangen {bus.device} -I 7FF -L 8 -D r -g 0 -p 10"):
         done = bus.flasher("doctor", folder=tmp_path)
         printed = reader.obeys(done)
-    assert f"flasher monitor -i socketcan -c {bus.tool}" in printed, done.said
+    assert f"flasher monitor -i socketcan -c {bus.tool}" in printed, done.reported
 
 
 # -- no interface, or too many ---------------------------------------------------------------------
@@ -271,7 +273,7 @@ def test_what_is_printed_of_a_missing_interface_succeeds(
         done = run(*command, *on(channel), folder=tmp_path)
         assert done.end() == BUS
         # It cannot be plugged in here.
-        assert reader.obeys(done, but={f"ip link set {channel} up type can": 1}), done.said
+        assert reader.obeys(done, but={f"ip link set {channel} up type can": 1}), done.reported
     if channel.startswith("vcan"):
         assert run("doctor", *on(channel), folder=tmp_path).end() == OK
         root(f"ip link delete {channel}")
@@ -283,5 +285,5 @@ def test_what_is_printed_where_nothing_is_named_succeeds(reader: Reader, tmp_pat
     for arguments in (("doctor",), ("adapters",), ("info", "-t", "bms")):
         done = run(*arguments, folder=tmp_path)
         reader.obeys(done)
-        for named in re.findall(r"-i socketcan -c (\w+)", done.said):
+        for named in re.findall(r"-i socketcan -c (\w+)", done.reported):
             reader.types(f"flasher monitor -i socketcan -c {named}")

@@ -53,10 +53,10 @@ def test_an_upgrade_survives_commands_beside_it_and_a_program_that_knows_no_lock
             for refused in (read, second):
                 assert refused.code == 4, refused.err
                 assert f"in use by flasher flash (process {flash.pid}, since 20" in refused.err
-            said = flash.stdout.read().splitlines()
-        assert flash.wait() == 0, said[-1]
+            reported = flash.stdout.read().splitlines()
+        assert flash.wait() == 0, reported[-1]
         assert flasher("read", "history", "-t", "bms", *bus).code == 0, "the lock is given back"
         mock.wait_for("image:")
         assert (tmp_path / "out.bin").read_bytes() == IMAGE
-    asked = [event for event in map(json.loads, said) if event.get("event") == "ForeignQuery"]
+    asked = [event for event in map(json.loads, reported) if event.get("event") == "ForeignQuery"]
     assert [event["title"] for event in asked] == ["read user string 1"]

@@ -52,7 +52,7 @@ def test_a_flash_at_once_after_the_interface_was_started(bus: Pair, tmp_path: Pa
     """The kernel still reports NO-CARRIER then."""
     start(bus.tool, "restart-ms 100")
     done = bus.flasher(*FLASH, folder=tmp_path)
-    assert done.end() == ExitCode.OK, done.said
+    assert done.end() == ExitCode.OK, done.reported
     assert (tmp_path / "out.bin").read_bytes() == IMAGE
 
 
@@ -61,7 +61,7 @@ def test_doctor_has_nothing_to_report_of_an_interface_that_restarts(
     bus: Pair, tmp_path: Path
 ) -> None:
     done = bus.flasher("doctor", folder=tmp_path)
-    assert done.end() == ExitCode.OK, done.said
+    assert done.end() == ExitCode.OK, done.reported
     assert "after a bus-off" not in done.stdout
     assert "error counters: transmit 0, receive 0" in done.stdout
 
@@ -74,7 +74,7 @@ def test_an_interface_that_is_taken_down_and_up_in_a_transfer_goes_on(
     with Forked(*FLASH, *on(bus.tool), folder=tmp_path) as host:
         host.until("transferring ...")
         root(f"ip link set {bus.tool} down && sleep 1 && ip link set {bus.tool} up")
-        assert host.end() == ExitCode.OK, host.said
+        assert host.end() == ExitCode.OK, host.reported
     assert (tmp_path / "out.bin").read_bytes() == IMAGE
     assert "error: can." not in host.stderr
 
@@ -83,6 +83,6 @@ def test_an_interface_that_is_taken_down_and_up_in_a_transfer_goes_on(
 def test_an_interface_that_only_listens_is_refused(bus: Pair, tmp_path: Path) -> None:
     start(bus.tool, "listen-only on")
     done = bus.flasher(*FLASH, folder=tmp_path)
-    assert done.end() == ExitCode.BUS, done.said
+    assert done.end() == ExitCode.BUS, done.reported
     assert "only listens" in done.stderr
     assert bus.flasher("monitor", "--duration", "0.5", folder=tmp_path).end() == ExitCode.OK

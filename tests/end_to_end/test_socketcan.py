@@ -49,7 +49,7 @@ def transfer(device: Device, folder: Path, image: bytes, channel: str) -> Forked
     """Flash `image` and see that the device stored the same bytes."""
     (folder / "image.bin").write_bytes(image)
     done = run("flash", "-t", "bms", *on(channel), "image.bin", folder=folder)
-    assert done.end() == ExitCode.OK, done.said
+    assert done.end() == ExitCode.OK, done.reported
     device.until("image:")
     assert (folder / "out.bin").read_bytes() == image
     return done
@@ -69,7 +69,7 @@ def test_images_of_every_edge_size_arrive_over_vcan(tmp_path: Path) -> None:
 def test_no_device_on_vcan_is_exit_code_5(tmp_path: Path) -> None:
     image = str(SAMPLES / "obc.bin")
     done = run("flash", image, "-t", "obc", *on("vcan0"), "--timeout", "1", folder=tmp_path)
-    assert done.end() == ExitCode.NO_ANSWER, done.said
+    assert done.end() == ExitCode.NO_ANSWER, done.reported
     assert "this run erased nothing" in done.stderr
 
 

@@ -75,11 +75,11 @@ def test_what_the_suite_reached_can_be_measured(flasher: Flasher, tmp_path: Path
     subject = tmp_path / "coverage" / "boot"
     line = ("conformance", "-t", "bms", "--subject", subject, "--profile", PROFILE)
     assert flasher(*line, "--case", "RS-01", "--case", "TX-01", "--case", "EN-02").code == 0
-    told = subprocess.run(
+    printed = subprocess.run(
         ["gcov", "--object-directory", subject.parent, "boot-boot"],
         cwd=tmp_path, capture_output=True, text=True, check=True,
     )  # fmt: skip
-    share = re.search(r"boot\.c'\nLines executed:([\d.]+)%", told.stdout)
+    share = re.search(r"boot\.c'\nLines executed:([\d.]+)%", printed.stdout)
     assert share is not None
     assert 70 < float(share[1]) < 100
     assert re.search(r"^ +\d+\*?: +\d+:", (tmp_path / "boot.c.gcov").read_text(), re.MULTILINE)
@@ -183,9 +183,11 @@ def test_an_emulated_processor_is_flashed_twice_over_slcan(
     flasher: Flasher, tmp_path: Path
 ) -> None:
     _need("make", "arm-none-eabi-gcc", "qemu-system-arm")
-    said = make("arm", tmp_path)
-    sizes = re.findall(r"^ *(\d+)\s+(\d+)\s+\d+\s+\d+\s+\w+\s+\S*boot\.elf$", said, re.MULTILINE)
-    assert [int(text) + int(data) < FLASH_BYTES for text, data in sizes] == [True], said
+    reported = make("arm", tmp_path)
+    sizes = re.findall(
+        r"^ *(\d+)\s+(\d+)\s+\d+\s+\d+\s+\w+\s+\S*boot\.elf$", reported, re.MULTILINE
+    )
+    assert [int(text) + int(data) < FLASH_BYTES for text, data in sizes] == [True], reported
     make("arm", tmp_path / "newer", "APPLICATION_VERSION=V2r0r0_20260202")
     with emulated(tmp_path / "boot.elf", tmp_path / "monitor") as channel:
         line = ("-t", "bms", "-i", "slcan", "-c", channel, "--bus-kwargs", "sleep_after_open=0")

@@ -282,9 +282,9 @@ def test_what_candump_writes_is_read_as_well(capture: Path, folder: Path) -> Non
         writer(message_of(frame, sent=True, at_s=at))
     writer.stop()
     words = ("-Y", "welling.message", "-T", "fields", "-e", "frame.number", "-e", "welling.message")
-    told = run("-r", log, *words, folder=folder)
-    assert told == run("-r", capture, *words, folder=folder)
-    assert len(told.splitlines()) > 1000
+    printed = run("-r", log, *words, folder=folder)
+    assert printed == run("-r", capture, *words, folder=folder)
+    assert len(printed.splitlines()) > 1000
 
 
 # -- the course of an upgrade ---------------------------------------------------------------------
@@ -339,7 +339,7 @@ STORIES: Final = _stories()
 
 
 @pytest.fixture(scope="module")
-def told(folder: Path) -> dict[str, list[Item]]:
+def printed(folder: Path) -> dict[str, list[Item]]:
     """What tshark says of each story: all in one capture, with a minute between them."""
     frames: Frames = []
     first: dict[str, int] = {}
@@ -385,10 +385,10 @@ def _packets(of: list[Item]) -> dict[tuple[int, int], tuple[int, list[float]]]:
     ],
 )
 def test_packets_copies_and_answer_times_are_those_of_the_story(
-    name: str, told: dict[str, list[Item]]
+    name: str, printed: dict[str, list[Item]]
 ) -> None:
     (upgrade,) = _explained(name).upgrades
-    found = _packets(told[name])
+    found = _packets(printed[name])
     assert len(found) == len(upgrade.packets) >= 6
     for packet in upgrade.packets:
         copies, answers = found[packet.attempt, packet.number]
@@ -398,8 +398,10 @@ def test_packets_copies_and_answer_times_are_those_of_the_story(
         ), packet
 
 
-def test_every_upgrade_has_a_number_of_its_own(told: dict[str, list[Item]]) -> None:
-    numbers = {name: {each for item in told[name] for each in item.all("upgrade")} for name in told}
+def test_every_upgrade_has_a_number_of_its_own(printed: dict[str, list[Item]]) -> None:
+    numbers = {
+        name: {each for item in printed[name] for each in item.all("upgrade")} for name in printed
+    }
     assert [len(each) for each in numbers.values()] == [
         len(_explained(name).upgrades) for name in numbers
     ]
@@ -415,20 +417,20 @@ def _experts(of: list[Item]) -> set[str]:
     }
 
 
-def test_what_went_wrong_is_an_expert_information(told: dict[str, list[Item]]) -> None:
-    assert _experts(told["clean"]) == set()
-    assert _experts(told["nak and repetition"]) == {"crc", "nak", "repeated"}
+def test_what_went_wrong_is_an_expert_information(printed: dict[str, list[Item]]) -> None:
+    assert _experts(printed["clean"]) == set()
+    assert _experts(printed["nak and repetition"]) == {"crc", "nak", "repeated"}
 
 
 @pytest.mark.parametrize("name", STORIES)
 def test_a_second_tool_is_found_where_explain_finds_one(
-    name: str, told: dict[str, list[Item]]
+    name: str, printed: dict[str, list[Item]]
 ) -> None:
     is_foreign = any(
         each.verdict.cause is Cause.SECOND_TOOL or any("not explained" in of for of in each.remarks)
         for each in _explained(name).upgrades
     )
-    assert ("foreign_tool" in _experts(told[name])) == is_foreign
+    assert ("foreign_tool" in _experts(printed[name])) == is_foreign
 
 
 def test_two_buses_in_one_capture_are_two(folder: Path) -> None:

@@ -79,8 +79,8 @@ def run(*words: str | Path, folder: Path) -> str:
 
 def items(capture: Path, folder: Path, *options: str) -> Iterator[Item]:
     """What the dissector finds, in the order of the capture."""
-    told = run("-r", capture, "-T", "pdml", "-Y", "welling.kind", *options, folder=folder)
-    for packet in ET.fromstring(told):  # noqa: S314  tshark wrote it
+    printed = run("-r", capture, "-T", "pdml", "-Y", "welling.kind", *options, folder=folder)
+    for packet in ET.fromstring(printed):  # noqa: S314  tshark wrote it
         number = next(
             field.get("show") for field in packet.iter("field") if field.get("name") == "num"
         )

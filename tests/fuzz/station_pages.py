@@ -58,11 +58,11 @@ class _Station:
     clock: FakeClock
 
     def ask(self, request: bytes) -> browser.Answered:
-        is_nobody = request.startswith(_NOBODY)
+        is_signed_out = request.startswith(_NOBODY)
         self.login._attempts = Attempts()
         self.login.sign_ins = SignIns(self.clock, lambda _event, _data: None)
         session = {}
-        if not is_nobody:
+        if not is_signed_out:
             supervisor = next(each for each in PEOPLE if each.name == "Sue")
             session["sign_ins"] = self.login.sign_ins.begin(supervisor, "192.0.2.1", [])
         return browser.send(self.app, request.removeprefix(_NOBODY), browser.cookie(session))

@@ -347,14 +347,14 @@ def play(
         result,
         tuple(unit.device.stored_image == image.data for unit in units),
         tuple(unit.device.erase_count > count for unit, count in zip(units, before, strict=True)),
-        tuple(_tells(unit, units, heard) for unit in units),
+        tuple(_reports(unit, units, heard) for unit in units),
     )
 
 
 _UPGRADE: Final = (Command.UPDATE, Command.PACKET, Command.END_OF_TRANSFER)
 
 
-def _tells(unit: Slow, units: Sequence[Slow], heard: Log) -> int:
+def _reports(unit: Slow, units: Sequence[Slow], heard: Log) -> int:
     """From the first update command on: what reached the host, is no general feedback (R15), no
     announcement before request transfer, right after it (R11) or after the end, and not the very
     message that the other unit sent in the same moment.

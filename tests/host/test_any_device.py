@@ -59,24 +59,24 @@ def test_the_host_ends_explicitly_whatever_the_device_answers(
     steps: list[tuple[float, UpgradeMessage | Frame]],
 ) -> None:
     bench = Bench(300, options=UpgradeOptions(timeout_s=TIMEOUT_S, attempts=2))
-    said: list[tuple[float, UpgradeMessage]] = []
+    reported: list[tuple[float, UpgradeMessage]] = []
     for pause_s, what in steps:
         bench.wait(pause_s)
         if isinstance(what, Frame):
             bench.engine.receive(what, bench.now)
         else:
-            said.append((bench.now, what))
+            reported.append((bench.now, what))
             bench.say(what)
     bench.wait(TIMEOUT_S + 1.0)
     outcome = bench.outcome
     assert (outcome.error() is None) == outcome.ok
     assert len(bench.seen(events.AttemptStarted)) <= 1
-    _watch_update_commands(bench, said)
+    _watch_update_commands(bench, reported)
 
 
-def _watch_update_commands(bench: Bench, said: list[tuple[float, UpgradeMessage]]) -> None:
+def _watch_update_commands(bench: Bench, reported: list[tuple[float, UpgradeMessage]]) -> None:
     commands = [at for at, row in bench.sent if isinstance(row, UpdateCommand)]
-    asking = [at for at, row in said if isinstance(row, BootVersion | RequestTransfer)]
+    asking = [at for at, row in reported if isinstance(row, BootVersion | RequestTransfer)]
     assert len(commands) <= len(asking)
     for earlier, later in pairwise(commands):
         assert later - earlier >= 0.03
@@ -100,28 +100,32 @@ def test_one_update_command_at_most_goes_into_silence_and_none_to_an_application
         timeout_s=120.0, attempts=attempts, in_session=True, at_power_up=at_power_up
     )
     bench = Bench(300, options=options)
-    said: list[tuple[float, UpgradeMessage]] = []
+    reported: list[tuple[float, UpgradeMessage]] = []
     for pause_s, what in steps:
         bench.wait(pause_s)
         if not isinstance(what, Frame):
-            said.append((bench.now, what))
+            reported.append((bench.now, what))
             bench.say(what)
     bench.wait(121.0)
     commands = [at for at, row in bench.sent if isinstance(row, UpdateCommand)]
-    asking = [at for at, row in said if isinstance(row, BootVersion | RequestTransfer)]
+    asking = [at for at, row in reported if isinstance(row, BootVersion | RequestTransfer)]
     assert len(commands) <= len(asking) + bench.outcome.sent_into_silence
 
     def unheard(until_s: float) -> list[float]:
         """The commands before which nothing was said for the erase limit, until so long before."""
         return [
-            at for at in commands if not any(at - 9.9 < each <= at - until_s for each, _ in said)
+            at
+            for at in commands
+            if not any(at - 9.9 < each <= at - until_s for each, _ in reported)
         ]
 
     leaving_s = 0.0015  # what is said while it leaves does not call it back
     assert len(unheard(0.0)) <= bench.outcome.sent_into_silence <= len(unheard(leaving_s))
     for at in unheard(0.0):
         if at == commands[0]:
-            assert GeneralFeedbackMessage() not in [row for said_at, row in said if said_at < at]
+            assert GeneralFeedbackMessage() not in [
+                row for sent_at, row in reported if sent_at < at
+            ]
 
 
 @pytest.mark.slow

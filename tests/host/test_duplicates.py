@@ -263,8 +263,8 @@ def test_feedbacks_that_begin_in_the_middle_are_another_devices() -> None:
 def test_who_goes_on_after_complete_is_another_device(row: messages.UpgradeMessage) -> None:
     """Nothing more is asked of a WMC: it is listened for a moment."""
     stage = Stage("wmc")
-    said = split(WMC.answer_id, encode(row.to_message(WMC.answer_id)))
-    speaker = Speaker(*said, every_s=0.0005, begins_at=1e9, limit=2)
+    reported = split(WMC.answer_id, encode(row.to_message(WMC.answer_id)))
+    speaker = Speaker(*reported, every_s=0.0005, begins_at=1e9, limit=2)
     stage.bus.attach(speaker)
     complete = split(WMC.answer_id, encode(Complete().to_message(WMC.answer_id)))[0]
 

@@ -35,8 +35,8 @@ class Asked:
     def __init__(self, target: Target = BMS, options: UpgradeOptions | None = None) -> None:
         planned = plan(image_of(300), target, WELLING.bitrate_bps)
         chosen = options or UpgradeOptions()
-        self.told = IdentifyStage(planned, chosen)
-        self.engine = Runner(self.told.stage, bitrate_bps=planned.bitrate_bps)
+        self.noted = IdentifyStage(planned, chosen)
+        self.engine = Runner(self.noted.stage, bitrate_bps=planned.bitrate_bps)
         self.now = 10.0 - LISTEN_FIRST_S
         self.commands: list[int] = []
         self._wire = Reassembler(target.request_id, 1.0)
@@ -86,11 +86,11 @@ def test_a_battery_is_asked_for_its_version_and_its_state_and_no_more() -> None:
     asked.run(asked.now + SECOND_DEVICE_WAIT_S)
     assert asked.engine.done
     assert asked.commands == [0x3300, 0x3400]
-    assert asked.told.answers.version == version()
-    assert asked.told.answers.running == BATTERY
-    assert asked.told.answers.hardware_version == "V1r2r0_20220512"
-    assert asked.told.answers.firmware_version == "V1r0r0_20220512"
-    assert asked.told.two_devices == ""
+    assert asked.noted.answers.version == version()
+    assert asked.noted.answers.running == BATTERY
+    assert asked.noted.answers.hardware_version == "V1r2r0_20220512"
+    assert asked.noted.answers.firmware_version == "V1r0r0_20220512"
+    assert asked.noted.two_devices == ""
 
 
 @each("target", [WMC, OBC])
@@ -100,14 +100,14 @@ def test_who_has_no_query_is_not_asked(target: Target) -> None:
     asked.run(10.0)
     assert asked.engine.done
     assert asked.engine.next_frame(10.0) is None
-    assert asked.told.answers.version is None
+    assert asked.noted.answers.version is None
 
 
 def test_a_products_own_query_is_asked_too() -> None:
     """Here with the battery's own rows, sent to another target."""
     own = Request(catalogue.BY_KEY[(0x752, 0x3300)])
     asked = Asked(WMC, UpgradeOptions(version_request=own))
-    assert asked.told.asks
+    assert asked.noted.asks
 
 
 def test_silence_ends_it_after_a_second_and_the_rest_is_not_asked() -> None:
@@ -115,9 +115,9 @@ def test_silence_ends_it_after_a_second_and_the_rest_is_not_asked() -> None:
     asked.run(20.0)
     assert asked.engine.done
     assert set(asked.commands) == {0x3300}
-    assert asked.told.answers.version is None
-    assert asked.told.announcement is None
-    assert not asked.told.cancelled
+    assert asked.noted.answers.version is None
+    assert asked.noted.announcement is None
+    assert not asked.noted.cancelled
 
 
 def test_an_announcement_ends_it_at_once() -> None:
@@ -125,7 +125,7 @@ def test_an_announcement_ends_it_at_once() -> None:
     asked.run(10.1)
     asked.hear(answer_frames(BootVersion("BMS", "V1.2.3")))
     assert asked.engine.done
-    assert asked.told.announcement is not None
+    assert asked.noted.announcement is not None
     assert asked.engine.next_frame(asked.now) is None
 
 
@@ -135,7 +135,7 @@ def test_an_announcement_while_it_listens_first_is_kept_until_it_has_listened() 
     assert asked.engine.deadline() is not None
     asked.run(10.0)
     assert asked.engine.done
-    assert asked.told.announcement is not None
+    assert asked.noted.announcement is not None
     assert asked.commands == []
 
 
@@ -164,8 +164,8 @@ def test_different_answers_are_two_devices(other: Content) -> None:
     asked.say(VERSION, other)
     asked.run(20.0)
     assert asked.engine.done
-    assert "two devices answered" in asked.told.two_devices
-    assert "W1 / W2" in asked.told.two_devices or "V9r0r0_20250101" in asked.told.two_devices
+    assert "two devices answered" in asked.noted.two_devices
+    assert "W1 / W2" in asked.noted.two_devices or "V9r0r0_20250101" in asked.noted.two_devices
 
 
 def test_other_frames_on_its_ids_are_nothing() -> None:
@@ -174,11 +174,11 @@ def test_other_frames_on_its_ids_are_nothing() -> None:
     for can_id in (0x720, 0x725):
         asked.hear([Frame(can_id, b"\x05"), Frame(can_id, b"", is_remote=True)])
         asked.hear([Frame(can_id, b"\x55\xaa\x0c", is_extended=True)])
-    assert asked.told.answers.version is None
-    assert asked.told.announcement is None
+    assert asked.noted.answers.version is None
+    assert asked.noted.announcement is None
     asked.now = 10.2
     asked.say(VERSION, version())
-    assert asked.told.answers.version == version()
+    assert asked.noted.answers.version == version()
 
 
 def test_it_ends_at_the_end_of_the_message_when_it_is_cancelled() -> None:
@@ -188,7 +188,7 @@ def test_it_ends_at_the_end_of_the_message_when_it_is_cancelled() -> None:
     asked.engine.next_frame(asked.now)
     asked.engine.frame_sent(asked.now)
     asked.engine.cancel(asked.now)
-    assert asked.told.cancelled
+    assert asked.noted.cancelled
     assert not asked.engine.done
     asked.flush()
     asked.engine.tick(asked.now)

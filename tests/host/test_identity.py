@@ -174,12 +174,12 @@ def test_what_a_device_reports_is_shown_escaped() -> None:
         b"V\x1b[2J.".ljust(16),
     )
     device = DeviceAnswers(VersionInformation(*map(WireText, texts)))
-    said = [
+    reported = [
         found.text
         for found in judge_device(IMAGE, BMS, Identity(release(hardware_versions=("V1*",))), device)
     ]
-    assert said
-    assert not any("\x1b" in text or "\x07" in text for text in said)
+    assert reported
+    assert not any("\x1b" in text or "\x07" in text for text in reported)
 
 
 # -- every sentence, and what becomes of it -------------------------------------------------------

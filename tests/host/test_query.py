@@ -128,11 +128,11 @@ def test_of_a_quiet_question_nothing_is_reported() -> None:
             bench.engine.receive(frame, bench.now)
         bench.run(0.5)
         bench.say(0x720, 0x0C, 0x1540, VERSION)
-        told = [type(event) for event in bench.events]
+        noted = [type(event) for event in bench.events]
         assert query.answer is not None
         repeated = events.MessageRepeated
         expected = [repeated, events.BytesDamaged, repeated, events.QueryAnswered]
-        assert told == ([] if is_quiet else expected)
+        assert noted == ([] if is_quiet else expected)
         bench.run(2.0)
         assert bench.over()
 

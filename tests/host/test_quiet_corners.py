@@ -31,8 +31,8 @@ def test_messages_that_are_malformed_or_unknown_are_reported_by_command_and_id()
     bench = Bench()
     bench.to_packet(1)
     bench.say(Message(0x725, 0x16, 0xC202, b"\x01\x00"), Message(0x725, 0x0C, 0x7702, b"\x00\x00"))
-    told = [event.what for event in bench.events if isinstance(event, events.Reported)]
-    assert told == [
+    noted = [event.what for event in bench.events if isinstance(event, events.Reported)]
+    assert noted == [
         "message C202 from 725 ignored: mode is 16, not 0C",
         "unknown message 7702 from 725 ignored",
     ]

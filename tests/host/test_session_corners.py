@@ -117,8 +117,8 @@ class OnlyFirmware(Content):
 
 def test_a_device_that_does_not_report_its_hardware_is_refused_as_one_that_does_not_fit() -> None:
     release = release_of(IMAGE, BMS, hardware_versions=["V1r2r0_*"])
-    told = DeviceAnswers(OnlyFirmware(WireText(encode_text("V1r0r0_20220512", 16))))
-    findings = list(judge_device(IMAGE, BMS, Identity(release), told))
+    noted = DeviceAnswers(OnlyFirmware(WireText(encode_text("V1r0r0_20220512", 16))))
+    findings = list(judge_device(IMAGE, BMS, Identity(release), noted))
     hardware = next(found for found in findings if found.check is IdentityCheck.HARDWARE)
     assert hardware.verdict is CheckVerdict.REFUSED
     assert "does not report its hardware" in hardware.text

@@ -127,8 +127,8 @@ def test_a_battery_is_asked_before_the_reset_and_what_it_answered_is_kept() -> N
     assert dialogue.result.shutdown_heard is False
     assert dialogue.result.running_version is None
     assert dialogue.ended.statistics.attempts == 1
-    told = dialogue.seen(events.CheckMade)
-    assert ("downgrade", "passed") in [(e.check, e.verdict) for e in told]  # type: ignore[attr-defined]
+    noted = dialogue.seen(events.CheckMade)
+    assert ("downgrade", "passed") in [(e.check, e.verdict) for e in noted]  # type: ignore[attr-defined]
 
 
 def test_without_an_identity_nothing_is_asked_and_no_version_is_known() -> None:
@@ -153,9 +153,9 @@ def test_the_first_check_that_refuses_ends_it_and_all_are_reported() -> None:
     assert outcome.phase is Phase.IDENTIFY
     assert outcome.device_left is DeviceLeft.UNTOUCHED
     assert outcome.statistics.duration_s == pytest.approx(dialogue.now - 100.0, abs=1e-6)
-    told = [(e.check, e.verdict) for e in dialogue.seen(events.CheckMade)]  # type: ignore[attr-defined]
-    assert ("hardware", "refused") in told
-    assert ("downgrade", "refused") in told
+    noted = [(e.check, e.verdict) for e in dialogue.seen(events.CheckMade)]  # type: ignore[attr-defined]
+    assert ("hardware", "refused") in noted
+    assert ("downgrade", "refused") in noted
     assert not dialogue.unread
 
 
@@ -419,10 +419,10 @@ def ruled() -> Identity:
 def test_a_silent_device_that_may_sit_in_its_session_is_not_refused_by_a_rule_yet() -> None:
     dialogue = Dialogue(OPEN, identity=ruled())
     dialogue.wait(2.0)
-    told = {e.check: e for e in dialogue.events if isinstance(e, events.CheckMade)}
-    assert told["hardware"].verdict == "warned"
-    assert told["hardware"].text.endswith(": only a device in an open session is upgraded")
-    assert told["other-target"].verdict == "passed"
+    noted = {e.check: e for e in dialogue.events if isinstance(e, events.CheckMade)}
+    assert noted["hardware"].verdict == "warned"
+    assert noted["hardware"].text.endswith(": only a device in an open session is upgraded")
+    assert noted["other-target"].verdict == "passed"
     dialogue.wait(12.0)
     assert isinstance(dialogue.unread[-1], UpdateCommand)
     dialogue._read = len(dialogue.sent)

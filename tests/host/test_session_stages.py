@@ -278,9 +278,9 @@ def test_an_erased_device_is_upgraded_again_when_the_other_tool_was_silent_for_t
     assert stage.has == IMAGE.data
     assert witness.sent_again_at is not None
     assert 2.0 <= witness.sent_again_at - witness.heard_at < 2.01
-    (told,) = stage.seen(events.SecondToolAwaited)
-    assert OTHER_TOOL.data.hex(" ") in told.seen
-    assert told.quiet_s == 2.0
+    (noted,) = stage.seen(events.SecondToolAwaited)
+    assert OTHER_TOOL.data.hex(" ") in noted.seen
+    assert noted.quiet_s == 2.0
     (started,) = stage.seen(events.AttemptStarted)
     assert (started.attempt, started.reason) == (2, "second_tool")
 

@@ -209,10 +209,10 @@ def test_an_answer_is_waited_for_from_the_moment_in_which_the_packet_has_left(
     """And not from the one in which an adapter has taken its last frame."""
     bench = Bench()
     bench.to_request()
-    told = bench.engine.frame_sent
+    noted = bench.engine.frame_sent
 
     def take_at_once(at: float) -> None:
-        told(at)
+        noted(at)
         bench.now = at
 
     monkeypatch.setattr(bench.engine, "frame_sent", take_at_once)

@@ -515,8 +515,8 @@ def test_an_erased_device_that_announces_on_and_on_is_reset_and_commanded_again(
     bench.now += 0.1
     bench.say(BOOT)
     bench.expect(UpdateCommand)
-    told_at = bench.now
-    while bench.now < told_at + 10.1:
+    reported_at = bench.now
+    while bench.now < reported_at + 10.1:
         bench.now += 0.05
         bench.say(BOOT)
     started = [e.reason for e in bench.events if isinstance(e, events.AttemptStarted)]

@@ -56,12 +56,18 @@ def run(folder: str, words: list[str]) -> tuple[int, str, str, float, float]:
             finally:
                 os._exit(code)
         _, status, used = os.wait4(child, 0)
-        said = []
+        reported = []
         for file in (out, err):
             file.seek(0)
-            said.append(file.read().decode("utf-8", "replace"))
+            reported.append(file.read().decode("utf-8", "replace"))
     seconds = used.ru_utime + used.ru_stime
-    return os.waitstatus_to_exitcode(status), said[0], said[1], seconds, used.ru_maxrss / 1024
+    return (
+        os.waitstatus_to_exitcode(status),
+        reported[0],
+        reported[1],
+        seconds,
+        used.ru_maxrss / 1024,
+    )
 
 
 if __name__ == "__main__":

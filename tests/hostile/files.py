@@ -34,7 +34,7 @@ class Row:
     make: Callable[[Path], object]
     command: str
     code: int
-    said: str
+    reported: str
 
 
 def content(data: bytes | Callable[[], bytes]) -> Callable[[Path], object]:
@@ -313,9 +313,9 @@ def settings(command: str, code: int, *, some: int = 1) -> Iterator[Row]:
     """The same bad settings for each command that reads some, or every `some`-th of them; what is
     no file is wrong usage.
     """
-    for name, make, said in TOML[::some]:
+    for name, make, reported in TOML[::some]:
         usage = {"pipe": USAGE, "folder": USAGE}.get(name, code)
-        yield Row(f"{name}.toml", make, command, usage, said)
+        yield Row(f"{name}.toml", make, command, usage, reported)
 
 
 def bundle(
@@ -345,9 +345,9 @@ SCANS = tuple(
         f"station run --recipe {SAMPLES}/station/recipe.toml --mock-sockets 1 "
         "--database records.sqlite --scans FILE",
         USAGE,
-        said,
+        reported,
     )
-    for name, make, said in (
+    for name, make, reported in (
         ("pipe.txt", os.mkfifo, "not a regular file"),
         ("zero.txt", link("/dev/zero"), "not a regular file"),
         ("terabyte.txt", sparse(1 << 40), "too large"),
@@ -369,8 +369,8 @@ def report_with(number: str) -> bytes:
 
 
 REPORTS = tuple(
-    Row(name, make, "conformance diff FILE FILE", USAGE, said)
-    for name, make, said in (
+    Row(name, make, "conformance diff FILE FILE", USAGE, reported)
+    for name, make, reported in (
         ("pipe.json", os.mkfifo, "not a regular file"),
         ("terabyte.json", sparse(1 << 40), "too large"),
         ("deep.json", content(b"[" * 100_000), "not valid JSON"),
@@ -447,8 +447,8 @@ def several(*lines: str) -> bytes:
 
 
 TRACES = tuple(
-    Row(name, make, "explain FILE", code, said)
-    for name, make, code, said in (
+    Row(name, make, "explain FILE", code, reported)
+    for name, make, code, reported in (
         ("pipe.asc", os.mkfifo, USAGE, "not a regular file"),
         ("zero.log", link("/dev/zero"), USAGE, "not a regular file"),
         ("loop.log", link("loop.log"), USAGE, "symbolic links"),

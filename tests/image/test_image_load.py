@@ -438,9 +438,9 @@ def measure(path: Path) -> tuple[str, float, float]:
     done = subprocess.run(
         [sys.executable, "-c", MEASURE, str(path)], check=True, capture_output=True, text=True
     )
-    *said, figures = done.stdout.splitlines()
+    *reported, figures = done.stdout.splitlines()
     seconds, megabytes = map(float, figures.split())
-    return "".join(said), seconds, megabytes
+    return "".join(reported), seconds, megabytes
 
 
 @pytest.mark.parametrize(
@@ -467,16 +467,16 @@ def test_a_file_name_cannot_disturb_a_terminal(
         path.write_bytes(content)
     with pytest.raises((ImageError, UsageError)) as caught:
         load(path, **options)
-    said = str(caught.value)
-    assert "\x1b" not in said
-    assert "a\\x1b[31m\\nname" in said
+    reported = str(caught.value)
+    assert "\x1b" not in reported
+    assert "a\\x1b[31m\\nname" in reported
 
 
 @pytest.mark.slow
 def test_a_file_that_spans_gigabytes_is_refused_quickly_and_in_little_memory() -> None:
     assert (BAD / "gigabytes.hex").stat().st_size == 132
-    said, seconds, megabytes = measure(BAD / "gigabytes.hex")
-    assert "gap of 2281701360 bytes" in said
+    reported, seconds, megabytes = measure(BAD / "gigabytes.hex")
+    assert "gap of 2281701360 bytes" in reported
     assert seconds < 1
     assert megabytes < 64
 
@@ -484,8 +484,8 @@ def test_a_file_that_spans_gigabytes_is_refused_quickly_and_in_little_memory() -
 @pytest.mark.slow
 def test_the_largest_binary_is_planned_in_time_and_memory(tmp_path: Path) -> None:
     path = write(tmp_path, "app.bin", bytes(range(251, 0, -1)) * 33_000)
-    said, seconds, megabytes = measure(path)
-    assert not said
+    reported, seconds, megabytes = measure(path)
+    assert not reported
     assert seconds < 4  # about 1 on an idle desktop; room for a loaded one
     assert megabytes < 150
 
@@ -500,8 +500,8 @@ def test_a_hex_file_of_one_mebibyte_is_planned_in_little_memory(tmp_path: Path) 
             body = struct.pack(">BHB16s", 16, offset, 0, bytes(range(offset & 0x7F, 200))[:16])
             lines.append(f":{body.hex()}{-sum(body) & 0xFF:02x}")
     lines.append(":00000001ff")
-    said, seconds, megabytes = measure(write(tmp_path, "app.hex", "\n".join(lines).encode()))
-    assert not said
+    reported, seconds, megabytes = measure(write(tmp_path, "app.hex", "\n".join(lines).encode()))
+    assert not reported
     assert seconds < 4
     assert megabytes < 150
 

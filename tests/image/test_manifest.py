@@ -129,11 +129,11 @@ def test_what_breaks_the_rules_is_refused_by_name(
     path = written(tmp_path, text)
     with pytest.raises(ImageError) as refused:
         read_release(path)
-    said = str(refused.value)
-    assert what in said
-    assert more in said
-    assert str(path) in said
-    assert said.replace("\n", "").isprintable()
+    reported = str(refused.value)
+    assert what in reported
+    assert more in reported
+    assert str(path) in reported
+    assert reported.replace("\n", "").isprintable()
 
 
 def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:

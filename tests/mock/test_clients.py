@@ -153,7 +153,7 @@ def test_a_bus_that_takes_nothing_gets_one_copy_once_it_does() -> None:
 
 
 @each(
-    "which, dialect, said",
+    "which, dialect, reported",
     [
         (
             Node.WMC,
@@ -167,16 +167,16 @@ def test_a_bus_that_takes_nothing_gets_one_copy_once_it_does() -> None:
     ],
 )
 def test_shutdown_is_answered_with_ready_and_the_wmc_sends_goodbye_in_the_older_dialect(
-    which: Node, dialect: Dialect, said: list[tuple[int, int, int, bytes]]
+    which: Node, dialect: Dialect, reported: list[tuple[int, int, int, bytes]]
 ) -> None:
     talk = node(which, dialect)
     talk.run(0.1)
     talk.take()
     talk.put(*SHUTDOWN)
-    assert questions(talk) == said
+    assert questions(talk) == reported
     # Each announcement asks anew, the goodbye is said once.
     talk.put(*SHUTDOWN)
-    assert questions(talk) == said[:1]
+    assert questions(talk) == reported[:1]
     talk.run(60.0)
     assert questions(talk) == []
 

@@ -212,13 +212,13 @@ class _Echoed(System):
 
 @each("dialect", DIALECTS)
 def test_a_bus_that_gives_own_frames_back_is_answered_once(dialect: Dialect) -> None:
-    said = []
+    reported = []
     for build_system in (System, _Echoed):
         talk = Talk(build_system(dialect))
         talk.run(10.0)
-        said.append(Counter((heard.can_id, heard.command) for heard in talk.take()))
-    assert said[0] == said[1]
-    assert said[0][0x720, 0x1010] > 5
+        reported.append(Counter((heard.can_id, heard.command) for heard in talk.take()))
+    assert reported[0] == reported[1]
+    assert reported[0][0x720, 0x1010] > 5
 
 
 def test_a_device_without_an_application_announces_itself_while_the_others_talk() -> None:

@@ -657,7 +657,7 @@ def announcements_a_quarter_of_a_minute_after_a_power_cut(tool: Tool) -> object:
 
 
 @does("feedback-after-version", right=["feedback", "version"], wrong=["version", "feedback"])
-def what_is_said_first_after_a_reset(tool: Tool) -> object:
+def what_is_sent_first_after_a_reset(tool: Tool) -> object:
     tool.reset()
     tool.run(0.06)
     return tool.heard()

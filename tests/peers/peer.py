@@ -153,28 +153,28 @@ class Peer:
     def deadline(self) -> float | None:
         """The next alarm, or when there is something to say."""
         times = [alarm[0] for alarm in self._alarms]
-        times += [said.not_before for said in self._outbox]
+        times += [reported.not_before for reported in self._outbox]
         return min(times, default=None)
 
     def next_frame(self, now: float) -> Any:
         """The next frame, the same one until it was sent; None when nothing is due."""
         if not self._sent_frames:
-            self._outbox.sort(key=lambda said: (said.not_before > now, said.order))
+            self._outbox.sort(key=lambda reported: (reported.not_before > now, reported.order))
             if not self._outbox or self._outbox[0].not_before > now:
                 return None
         return self._outbox[0].frames[self._sent_frames]
 
     def frame_sent(self, now: float) -> None:
         """The bus took the frame."""
-        said = self._outbox[0]
+        reported = self._outbox[0]
         self._sent_frames += 1
-        if self._sent_frames < len(said.frames):
+        if self._sent_frames < len(reported.frames):
             return
         self._outbox.pop(0)
         self._sent_frames = 0
-        self.log.append(Entry(now, "said", said.what, said.number))
-        if said.then is not None:
-            said.then(now)
+        self.log.append(Entry(now, "said", reported.what, reported.number))
+        if reported.then is not None:
+            reported.then(now)
 
     def cancel(self, now: float) -> None:
         """End after the message that is begun."""

@@ -123,11 +123,11 @@ def test_a_running_application_answers_bootloader_writes_and_erases_nothing() ->
     for text in (WORDINGS["bms"].update_128, WORDINGS["bms"].end):
         for payload in literal(text):
             device.receive(Frame(0x752, payload), 0.0)
-    said = []
+    reported = []
     while (frame := device.next_frame(0.0)) is not None:
-        said.append(frame.data)
+        reported.append(frame.data)
         device.frame_sent(0.0)
-    assert said == literal(WORDINGS["bms"].feedback) * 2
+    assert reported == literal(WORDINGS["bms"].feedback) * 2
     assert device.old_application_whole
 
 

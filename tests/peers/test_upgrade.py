@@ -50,9 +50,9 @@ def test_a_dialogue_has_the_documents_order() -> None:
 
 def test_announcements_come_four_times_fifty_milliseconds_apart_then_the_application() -> None:
     host, device = upgrade(host=HostScript(update_on_version=99))
-    said = device.times("version", "said")
-    assert len(said) == 4
-    gaps_s = [later - sooner for sooner, later in itertools.pairwise(said)]
+    reported = device.times("version", "said")
+    assert len(reported) == 4
+    gaps_s = [later - sooner for sooner, later in itertools.pairwise(reported)]
     assert gaps_s == pytest.approx([0.05] * 3, abs=2 * FRAME_S)
     assert device.state == "application"
     assert host.outcome == "no boot version"
@@ -104,12 +104,12 @@ def test_the_bms_answers_its_version_before_and_after_theupgrade() -> None:
     for _ in range(2):
         for frame in query:
             device.receive(frame, now)
-        said = b""
+        reported = b""
         while (frame := device.next_frame(now)) is not None:
             assert frame.can_id == 0x720
-            said += frame.data
+            reported += frame.data
             device.frame_sent(now)
-        assert intact(0x720, said)
-        texts.append(said[6 + 48 : 6 + 64])
+        assert intact(0x720, reported)
+        texts.append(reported[6 + 48 : 6 + 64])
         now = run(ScriptedHost("bms", IMAGE), device, start_s=now, linger_s=1.0)
     assert texts == [b"V1r2r2_20220401.", b"V1r2r3_20220512."]

@@ -245,9 +245,9 @@ def hostile_story(text: str) -> Story:
         remarks=(text,),
         verdict=verdict,
     )
-    told = story(bad, source=text)
+    printed = story(bad, source=text)
     return replace(
-        told,
+        printed,
         format=text,
         talkers=(Talker(0x123, is_extended=False, name=text, frames=1, kind=TalkerKind.FOREIGN),),
         steps=steps,

@@ -50,9 +50,9 @@ def test_a_drawing_with_meaning_has_a_title_and_a_description() -> None:
 
 
 def test_the_verdict_comes_first() -> None:
-    said = Page(render(EVERY_KIND["troubled"])).text
+    reported = Page(render(EVERY_KIND["troubled"])).text
     places = [
-        said.index(text)
+        reported.index(text)
         for text in (
             "went wrong",
             "stopped answering at packet 311 of 613",
@@ -82,9 +82,9 @@ def test_a_good_upgrade_names_the_running_version_and_no_trouble() -> None:
 
 
 def test_the_answer_times_of_packets_sent_once_are_counted() -> None:
-    said = Page(render(EVERY_KIND["troubled"])).text
-    assert "How many packets were answered in which time" in said
-    assert "307 values from 1 ms to 80 ms" in said
+    reported = Page(render(EVERY_KIND["troubled"])).text
+    assert "How many packets were answered in which time" in reported
+    assert "307 values from 1 ms to 80 ms" in reported
     assert "How many packets" not in Page(render(EVERY_KIND["one packet"])).text
 
 
@@ -123,8 +123,10 @@ def test_the_wall_time_is_shown_in_utc_and_nonsense_is_left_out() -> None:
 
 
 def test_what_the_recording_tool_noted_is_shown() -> None:
-    said = Recorded("flasher flash bms.hex -t bms", 7, "a packet was not acknowledged\n  where: x")
-    page = Page(render(replace(EVERY_KIND["troubled"], recorded=said)))
+    reported = Recorded(
+        "flasher flash bms.hex -t bms", 7, "a packet was not acknowledged\n  where: x"
+    )
+    page = Page(render(replace(EVERY_KIND["troubled"], recorded=reported)))
     assert "exit code 7" in page.text
     assert "a packet was not acknowledged" in page.text
 
@@ -132,8 +134,8 @@ def test_what_the_recording_tool_noted_is_shown() -> None:
 @pytest.mark.slow
 @each("text", stories.HOSTILE)
 def test_hostile_text_is_shown_and_does_nothing(text: str) -> None:
-    told = replace(stories.hostile_story(text), recorded=Recorded(text, None, text))
-    page = Page(render(told))
+    printed = replace(stories.hostile_story(text), recorded=Recorded(text, None, text))
+    page = Page(render(printed))
     assert_self_contained(page)
     assert_visible(page.html)
     harmless = Page(render(replace(stories.hostile_story("x"), recorded=Recorded("x", None, "x"))))
@@ -176,8 +178,10 @@ def test_a_trace_full_of_trouble_makes_a_page_of_bounded_size() -> None:
         attempts=5,
         remarks=("again",) * 500,
     )
-    told = replace(stories.story(*[bad] * 10), talkers=stories.talkers() * 3000, talkers_left_out=7)
-    page = Page(render(told))
+    printed = replace(
+        stories.story(*[bad] * 10), talkers=stories.talkers() * 3000, talkers_left_out=7
+    )
+    page = Page(render(printed))
     assert len(page.html.encode()) < 1.2 * MEGABYTE
     assert "3,975 more are not listed." in page.text
     assert "5,907 more are not listed." in page.text
@@ -191,8 +195,8 @@ def test_each_of_the_last_attempts_has_its_latency_chart() -> None:
     packets = tuple(
         stories.good_packet(number, attempt) for attempt in range(1, 6) for number in range(1, 21)
     )
-    said = Page(render(stories.story(replace(good, attempts=5, packets=packets)))).text
-    assert [f"each packet, attempt {attempt} " in said for attempt in range(1, 6)] == [
+    reported = Page(render(stories.story(replace(good, attempts=5, packets=packets)))).text
+    assert [f"each packet, attempt {attempt} " in reported for attempt in range(1, 6)] == [
         False,
         False,
         True,
@@ -213,21 +217,21 @@ def test_an_upgrade_that_never_sent_a_packet_has_neither_chart_nor_link_report()
         boot_version=None,
         running_version=None,
     )
-    said = Page(render(stories.story(bare))).text
-    assert "never announced" in said
-    assert "size not in the trace" in said
-    assert "Link report" not in said
-    assert "Answer time of each packet" not in said
+    reported = Page(render(stories.story(bare))).text
+    assert "never announced" in reported
+    assert "size not in the trace" in reported
+    assert "Link report" not in reported
+    assert "Answer time of each packet" not in reported
 
 
 def test_figures_that_were_not_measured_are_named_so() -> None:
     silent = tuple(PacketStory(n, 1, 1, 0, n / 10, None, None) for n in range(1, 4))
-    told: Story = stories.story(
+    printed: Story = stories.story(
         replace(stories.upgrade(3), packets=silent, link=stories.link_of(silent))
     )
-    said = Page(render(told)).text
-    assert "share of the line rate not measured" in said
-    assert "the device's answer to a packet not measured" in said
+    reported = Page(render(printed)).text
+    assert "share of the line rate not measured" in reported
+    assert "the device's answer to a packet not measured" in reported
 
 
 @each(
@@ -249,8 +253,8 @@ def test_only_what_the_device_confirmed_is_good(cause: Cause, status: Status) ->
 
 def test_other_speakers_share_one_lifeline() -> None:
     crowd = tuple(stories.says(n / 10, f"N{n}>BMS", "hello") for n in range(9))
-    told = replace(stories.upgrade(1), steps=(*stories.opening(), *crowd))
-    drawn = Page(render(stories.story(told))).drawings
+    printed = replace(stories.upgrade(1), steps=(*stories.opening(), *crowd))
+    drawn = Page(render(stories.story(printed))).drawings
     first = next(one for one in drawn if one.get("role") == "group")
     names = [one.text for one in first.iter("text") if one.get("class") == "mid strong"]
     assert names[:2] == ["CDL", "BMS"]

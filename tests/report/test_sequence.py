@@ -110,8 +110,8 @@ def test_a_long_diagram_comes_in_parts_that_lose_nothing() -> None:
     items = [arrow(0.1 * number, title=f"step {number}") for number in range(120)]
     parts = diagram(items, ["CDL", "BMS"], WIDE)
     assert len(parts) > 2
-    said = [row.lines[0] for part in parts for row in part.rows]
-    assert said == [item.title for item in items]
+    reported = [row.lines[0] for part in parts for row in part.rows]
+    assert reported == [item.title for item in items]
     assert all(len(part.lifelines) == 2 and part.height < 900 for part in parts)
 
 

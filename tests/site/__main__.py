@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Final
 
 from tests.site.pages import Site
-from tests.site.questions import told, unanswered
+from tests.site.questions import noted, unanswered
 
 _ROOT: Final = Path(__file__).parents[2]
 _MADE_BY_SPHINX: Final = ".buildinfo"
@@ -74,7 +74,7 @@ def main() -> int:
         f"{took_s:.1f} s\n"
     )
     if options.questions:
-        sys.stdout.writelines(f"{line}\n" for line in told(site))
+        sys.stdout.writelines(f"{line}\n" for line in noted(site))
     if options.zip:
         pack(options.folder, options.zip)
         sys.stdout.write(f"{options.zip}: {options.zip.stat().st_size / 1e6:.1f} MB\n")

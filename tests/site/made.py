@@ -107,13 +107,13 @@ def _options(command: click.Command, path: str) -> _Lines:
         if param.name not in shared:
             panels.setdefault(getattr(param, "panel", None) or "options", []).append(param)
     for panel, params in panels.items():
-        rows = ((_names(param), _prose(_told(param))) for param in params)
+        rows = ((_names(param), _prose(_reported(param))) for param in params)
         yield from _table(f"{panel[0].upper()}{panel[1:]}", "meaning", rows=rows)
     if isinstance(command, HelpedCommand) and not isinstance(command, Program):
         yield from _examples(command.epilog or "")
         numbers = sorted({0, 1, 2, *(int(code) for code in command.exit_codes)})
-        told = ", ".join(str(number) for number in numbers)
-        yield from (f"[Exit codes](../exit_codes.md) of `{path}`: {told}.", "")
+        noted = ", ".join(str(number) for number in numbers)
+        yield from (f"[Exit codes](../exit_codes.md) of `{path}`: {noted}.", "")
 
 
 def _names(param: click.Parameter) -> str:
@@ -128,7 +128,7 @@ def _names(param: click.Parameter) -> str:
     return "<br>".join(f"`{name}{value if name == names[-1] else ''}`" for name in names)
 
 
-def _told(param: click.Parameter) -> str:
+def _reported(param: click.Parameter) -> str:
     text = getattr(param, "help", "") or ""
     default = param.default
     if param.required:
@@ -222,11 +222,11 @@ def _documents(prefix: str) -> _Lines:
                 yield from (_type(each), "")
             if "properties" not in each:
                 continue
-            told = {"schema", "event", "text", "command", "ok", "exit_code"}
+            noted = {"schema", "event", "text", "command", "ok", "exit_code"}
             rows = [
                 (f"`{key}`", _type(value), _prose(value.get("description", "")))
                 for key, value in each["properties"].items()
-                if key not in told
+                if key not in noted
             ]
             if any(row[2] for row in rows):
                 yield from _table("key", "value", "meaning", rows=iter(rows))

@@ -25,7 +25,7 @@ class Page(HTMLParser):
         self.path = path
         text = path.read_text(encoding="utf-8")
         self.links: list[str] = []
-        self.told: list[str] = []
+        self.noted: list[str] = []
         """Those of the text, without the menus."""
         self.text = ""
         self._depth = 0
@@ -40,7 +40,7 @@ class Page(HTMLParser):
                 self.anchors.add(value or "")
             elif tag == "a" and name == "href":
                 self.links.append(value or "")
-                self.told += [value or ""] * bool(self._depth)
+                self.noted += [value or ""] * bool(self._depth)
             elif (tag, name) in _LOADS:
                 self.loads.append(value or "")
 

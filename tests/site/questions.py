@@ -125,7 +125,7 @@ def ways(site: Site) -> dict[Path, list[Path]]:
     found: dict[Path, list[Path]] = {front: []}
     waiting = [front]
     for path in waiting:
-        for link in site.pages[path].told:
+        for link in site.pages[path].noted:
             target = site.target(site.pages[path], link) if "://" not in link else None
             if target in site.pages and target not in found:
                 found[target] = [*found[path], target]
@@ -146,7 +146,7 @@ def unanswered(site: Site) -> Iterator[str]:
             yield f"{question.page} is more than {CLICKS_MAX} clicks from the front page"
 
 
-def told(site: Site) -> Iterator[str]:
+def noted(site: Site) -> Iterator[str]:
     """Each question with its way."""
     known = ways(site)
     for question in QUESTIONS:

@@ -212,9 +212,9 @@ class Bench:
     def traced(self, serial: str) -> Path:
         """The trace of a good run of this unit, another one each time."""
         self._traces += 1
-        said = run_messages(serial, BMS_VERSION, IMAGES[BMS])
+        reported = run_messages(serial, BMS_VERSION, IMAGES[BMS])
         path = self.folder / f"run-{self._traces}.log.gz"
-        return write_trace(path, said, at_s=1_779_000_000.0 + self._traces)
+        return write_trace(path, reported, at_s=1_779_000_000.0 + self._traces)
 
     def use(self, text: str) -> None:
         """Go on with another recipe."""

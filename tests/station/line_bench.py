@@ -50,7 +50,7 @@ class ScriptedPort:
 
     def __init__(self, setup: WorkerSetup) -> None:
         self.setup = setup
-        self.said: deque[FromWorker] = deque()
+        self.reported: deque[FromWorker] = deque()
         self.heard: list[ToWorker] = []
         self.is_gone = False
         self.killed = 0
@@ -65,8 +65,8 @@ class ScriptedPort:
         return not self.is_gone
 
     def receive(self) -> FromWorker | None:
-        if self.said:
-            return self.said.popleft()
+        if self.reported:
+            return self.reported.popleft()
         if self.is_gone:
             raise EOFError
         return None
@@ -159,7 +159,7 @@ class LineBench:
         self.station.turn(0.0)
 
     def say(self, socket: str, message: FromWorker) -> None:
-        self.ports[socket].said.append(message)
+        self.ports[socket].reported.append(message)
         self.turn()
 
     def arrive(self, socket: str, serial: str | None = "") -> None:

@@ -58,7 +58,7 @@ class Bay:
 
     unit: Unit | None = None
     works: bool = True
-    told: tuple[bool, str | None] | None = None
+    noted: tuple[bool, str | None] | None = None
     """What its process said last of the unit; None: nothing since it began, or since a run."""
     run: str = ""
     """The label that its process works on."""
@@ -125,7 +125,7 @@ class World:
             self.runs[label] = RunState.INTERRUPTED
         self.shown.clear()
         for bay in self.bays.values():
-            bay.works, bay.told, bay.run = False, None, ""
+            bay.works, bay.noted, bay.run = False, None, ""
         self.tick()
 
     def tick(self, seconds: float = 0.0) -> None:
@@ -134,7 +134,7 @@ class World:
         while self.now < until:
             self.now = min(self.now + 0.5, until)
             for name, bay in self.bays.items():
-                if not bay.works or bay.run or bay.told == self.truth(bay):
+                if not bay.works or bay.run or bay.noted == self.truth(bay):
                     bay.differs_since = None
                 elif bay.differs_since is None:
                     bay.differs_since = self.now
@@ -221,7 +221,7 @@ class World:
     def end_run(self, name: str, outcome: RunState) -> None:
         bay = self.bays[name]
         label, unit = bay.run, bay.unit
-        bay.run, bay.told = "", None
+        bay.run, bay.noted = "", None
         if unit is None or unit.is_asleep or self.says_other(unit, label):
             outcome = RunState.ERROR
         elif outcome is RunState.PASS:
@@ -253,9 +253,9 @@ class World:
         if bay.run:
             return
         sees = self.truth(bay)
-        if bay.told == sees:
+        if bay.noted == sees:
             return
-        bay.told = sees
+        bay.noted = sees
         self.feed(name, PresenceChanged(is_there=sees[0], how="traffic", serial=sees[1]))
 
     @staticmethod
@@ -268,7 +268,7 @@ class World:
         bay.works = False
         if bay.run:
             self.end_run(name, RunState.ERROR)
-        bay.told = None
+        bay.noted = None
         self.feed(name, AdapterDown("its process ended"))
 
     # -- what is looked at ------------------------------------------------------------------------
@@ -287,8 +287,8 @@ class World:
     def check_green(self) -> None:
         """PASS stands over no other unit that is heard."""
         for name, event in self.shown.items():
-            unit, told = self.bays[name].unit, self.bays[name].told
-            if event.state is SocketState.PASS and unit is not None and told and told[0]:
+            unit, noted = self.bays[name].unit, self.bays[name].noted
+            if event.state is SocketState.PASS and unit is not None and noted and noted[0]:
                 assert unit.has_passed, f"{name} shows PASS over the unit of {unit.label}"
 
 
@@ -383,8 +383,8 @@ class Operator:
 
     def follow(self, unit: Unit) -> str:
         """Do what was said last; what to scan next, where it is not the label."""
-        said = [e for e in self.world.heard if isinstance(e, ScanRefused | OperatorPrompted)]
-        for event in reversed(said):
+        reported = [e for e in self.world.heard if isinstance(e, ScanRefused | OperatorPrompted)]
+        for event in reversed(reported):
             refused = isinstance(event, ScanRefused)
             text = event.remedy if isinstance(event, ScanRefused) else event.text
             code = event.code if isinstance(event, ScanRefused) else ""
@@ -498,7 +498,7 @@ class Walk:
         _, bay = self.some()
         unit = bay.unit
         # Nobody puts a unit in that sleeps: it falls asleep after it was heard.
-        if unit is not None and (unit.is_asleep or (bay.told and bay.told[0])):
+        if unit is not None and (unit.is_asleep or (bay.noted and bay.noted[0])):
             unit.is_asleep = not unit.is_asleep
             self.world.note(f"{unit}")
 

@@ -45,8 +45,8 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     made.make(lot="L<1> & ﬁ")
     run_id = made.claim("W2605003").run_id
     made.work(run_id)
-    said = [Measurement("voltage", 36.25, "V", 30.0, 42.0), Measurement("model", text="<b>M1")]
-    made.store.step(run_id, "check", StepState.PASS, duration_s=1.0, measurements=said)
+    reported = [Measurement("voltage", 36.25, "V", 30.0, 42.0), Measurement("model", text="<b>M1")]
+    made.store.step(run_id, "check", StepState.PASS, duration_s=1.0, measurements=reported)
     made.store.finish(run_id, made.ending(trace=made.traced("W2605003")))
     yield made
     made.store.close()
@@ -126,14 +126,14 @@ def test_one_changed_character_is_reported(plant: Bench) -> None:
 @pytest.mark.slow
 def test_every_word_that_a_reader_sees_is_covered(plant: Bench) -> None:
     text = page(plant)
-    for said, changed in {
+    for reported, changed in {
         "PASS</span>": "FAIL</span>", "bms.bin": "bmw.bin", ">jo<": ">al<",
         "line-2, A": "line-2, B", "NO_ANSWER": "NONE", "8 s": "7 s",
         "version read back": "memory read back", "2026-05-17 09:00:18": "2026-05-18 09:00:18",
     }.items():  # fmt: skip
-        assert said in text
-        found = checked(plant, text.replace(said, changed, 1))
-        assert any("its page was changed: it shows" in each for each in found.problems), said
+        assert reported in text
+        found = checked(plant, text.replace(reported, changed, 1))
+        assert any("its page was changed: it shows" in each for each in found.problems), reported
 
 
 CHANGES: dict[str, Callable[[dict[str, Any]], object]] = {

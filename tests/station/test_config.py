@@ -73,11 +73,11 @@ def test_a_station_file_is_read_with_places_beside_it(tmp_path: Path) -> None:
 
 def test_the_heads_are_kept_in_one_place_or_in_several(tmp_path: Path) -> None:
     url = "postgresql://flasher_heads@plant-db/heads"
-    for said, places in {
+    for reported, places in {
         '"share"': (str(tmp_path / "share"),),
         f'["/mnt/heads", "{url}"]': ("/mnt/heads", url),
     }.items():
-        assert load_config(written(tmp_path, f"heads = {said}\n{USUAL}")).heads == places
+        assert load_config(written(tmp_path, f"heads = {reported}\n{USUAL}")).heads == places
     for wrong in ('""', '["a", ""]', "7", "[7]"):
         with pytest.raises(UsageError, match="heads"):
             load_config(written(tmp_path, f"heads = {wrong}\n{USUAL}"))
@@ -113,8 +113,8 @@ def test_what_is_wrong_with_a_station_file_is_named(
 ) -> None:
     with pytest.raises(UsageError) as caught:
         load_config(written(tmp_path, USUAL.replace(old, new, 1)))
-    said = str(caught.value)
-    assert any(each in said for each in why.split("|")), said
+    reported = str(caught.value)
+    assert any(each in reported for each in why.split("|")), reported
 
 
 def test_adapters_are_found_by_what_they_are_not_by_their_order(tmp_path: Path) -> None:

@@ -367,17 +367,17 @@ STORIES = {
 }
 
 
-def told(text: str) -> Played:
+def noted(text: str) -> Played:
     return play(Story.parse(text))
 
 
 @pytest.mark.parametrize("name", STORIES)
 def test_no_label_ends_on_another_unit_and_nothing_blocks(name: str) -> None:
-    assert told(STORIES[name]).text == ""
+    assert noted(STORIES[name]).text == ""
 
 
 def test_units_that_are_not_exchanged_pass() -> None:
-    played = told(
+    played = noted(
         "line sockets=2 ; unit label=1 ; unit label=2 number=maker ; unit label=3 number=own ;"
         " person name=jo ; @3.0 put unit=1 socket=A ; @4.0 card by=jo unit=1 ;"
         " @4.5 label by=jo unit=1 ; @5.0 put unit=2 socket=B ; @6.0 card by=jo unit=2 ;"
@@ -401,7 +401,7 @@ def test_units_that_are_not_exchanged_pass() -> None:
     ],
 )
 def test_a_run_of_a_recipe_ends(recipe: str, acts: str, outcome: str) -> None:
-    played = told(
+    played = noted(
         f"line sockets=1 recipe={recipe} ; unit label=1 pace=slow ; unit label=2 ; person name=jo ;"
         f" @3.0 put unit=1 socket=A ; @4.0 card by=jo unit=1 ; @4.5 label by=jo unit=1 ; {acts}"
     )
@@ -411,7 +411,7 @@ def test_a_run_of_a_recipe_ends(recipe: str, acts: str, outcome: str) -> None:
 
 
 def test_who_cannot_be_asked_has_to_stay_from_its_first_update_command_on() -> None:
-    played = told(
+    played = noted(
         "line sockets=1 recipe=wmc ; unit label=1 pace=slow ; unit label=3 pace=slow ;"
         " person name=jo source=jo ; @2.0 label by=jo unit=3 ; @2.8 put unit=3 socket=A ;"
         " @3.0 pull unit=3 ; @3.5 put unit=1 socket=A"
@@ -424,7 +424,7 @@ def test_who_cannot_be_asked_has_to_stay_from_its_first_update_command_on() -> N
 @pytest.mark.parametrize("again", ["", " @11.5 card by=al unit=2 ;"])
 def test_a_unit_that_no_one_could_ask_is_counted_by_how_it_was_exchanged(again: str) -> None:
     """Also when somebody else scans the card that waits once more, at the same page."""
-    played = told(
+    played = noted(
         "line sockets=1 recipe=wmc ; unit label=1 ; unit label=2 ; person name=jo ;"
         " person name=al ; @3.0 put unit=1 socket=A ; @9.0 card by=jo unit=1 ;"
         f" @10.0 pull unit=1 ; @11.0 put unit=2 socket=A ;{again}"
@@ -437,7 +437,7 @@ def test_a_unit_that_no_one_could_ask_is_counted_by_how_it_was_exchanged(again: 
 
 def test_a_unit_that_an_aborted_run_left_silent_in_its_transfer_is_scanned_twice() -> None:
     """Nobody can tell it from one that was pulled: the first scan ends as UNIT_CHANGED."""
-    played = told(
+    played = noted(
         "line sockets=1 recipe=held ; unit label=2 pace=slow ; person name=jo ; person name=al ;"
         " @3.0 put unit=2 socket=A ; @19.0 label by=jo unit=2 ; @20.0 station seconds=1.0 ;"
         " @29.0 pull unit=2 ; @99.04 put unit=2 socket=A ; @103.0 card by=al unit=2 socket=A ;"
@@ -451,7 +451,7 @@ def test_a_unit_that_an_aborted_run_left_silent_in_its_transfer_is_scanned_twice
 def test_a_label_whose_card_was_used_up_is_not_taken_for_one_that_was_scanned_alone() -> None:
     """Two people at one page scan the same card; the label of the first is refused. The label of
     the second follows before the refusal is read, when another unit is in the socket."""
-    played = told(
+    played = noted(
         "line sockets=1 recipe=plain ; unit label=1 ; unit label=2 ; unit label=3 ;"
         " person name=jo ; person name=al ; @10.0 put unit=1 socket=A ; @12.2 label by=jo unit=1 ;"
         " @12.4 pull unit=1 ; @13.0 put unit=2 socket=A ; @29.0 card by=al unit=2 ;"
@@ -463,7 +463,7 @@ def test_a_label_whose_card_was_used_up_is_not_taken_for_one_that_was_scanned_al
 
 def test_a_label_whose_card_was_forgotten_is_not_taken_for_one_that_was_scanned_alone() -> None:
     """A person reads the label 15 s after its card, when the units have changed places."""
-    played = told(
+    played = noted(
         "line sockets=1 recipe=plain ; unit label=1 ; unit label=2 ; person name=al ;"
         " @3.0 put unit=1 socket=A ; @10.0 card by=al unit=1 ; @24.7 pull unit=1 ;"
         " @25.05 put unit=2 socket=A ; @25.2 label by=al unit=1 ; @35.0 look"
@@ -473,7 +473,7 @@ def test_a_label_whose_card_was_forgotten_is_not_taken_for_one_that_was_scanned_
 
 def test_a_unit_that_came_in_a_stall_is_not_the_one_of_the_card_before() -> None:
     """The run begins in the moment in which the arrival of the other unit is read, 2.1 s late."""
-    played = told(
+    played = noted(
         "line sockets=1 recipe=plain ; unit label=1 number=maker ; unit label=2 number=own"
         " pace=slow ; person name=jo source=jo ; person name=al ;"
         " @22.676289 put unit=2 socket=A ; @27.084739 label by=al unit=2 ;"
@@ -488,7 +488,7 @@ def test_a_unit_that_came_in_a_stall_is_not_the_one_of_the_card_before() -> None
 
 
 def test_what_cannot_be_saved_is_never_green_and_the_line_goes_on() -> None:
-    played = told(
+    played = noted(
         "line sockets=1 ; unit label=1 ; person name=jo ; @3.0 put unit=1 socket=A ;"
         " @4.0 card by=jo unit=1 ; @4.5 label by=jo unit=1 ; @5.0 disk seconds=6.0 ; @9.0 look ;"
         " @10.0 resume by=jo ; @12.0 resume by=jo"
@@ -568,9 +568,9 @@ def test_no_step_puts_a_unit_where_another_one_is_awaited() -> None:
         "line sockets=2 ; unit label=1 ; unit label=2 ; person name=jo ;"
         f" @3.0 card by=jo unit=1 socket=A ; @4.0 label by=jo unit=1 ; {put}"
     )
-    assert [each.NAME for each in told(text).done] == ["card", "label"]
+    assert [each.NAME for each in noted(text).done] == ["card", "label"]
     without = text.replace("@4.0 label by=jo unit=1 ;", "")
-    assert [each.NAME for each in told(without).done] == ["card", "put"]
+    assert [each.NAME for each in noted(without).done] == ["card", "put"]
 
 
 # -- what nobody can detect ------------------------------------------------------------------------
@@ -677,7 +677,7 @@ UNDETECTABLE = {
 @pytest.mark.parametrize("name", UNDETECTABLE)
 def test_what_no_one_can_detect_is_counted_by_its_reason(name: str) -> None:
     reason, story = UNDETECTABLE[name]
-    played = told(story)
+    played = noted(story)
     assert played.seen is not None
     assert (played.text, played.seen[f"undetectable: {reason}"]) == ("", 1)
 
@@ -719,15 +719,15 @@ def test_what_somebody_could_detect_is_a_violation(monkeypatch: pytest.MonkeyPat
         " @2.0 put unit=3 socket=A ; @4.0 card by=mo unit=3 ; @4.5 label by=mo unit=3 ;"
         " @5.0 pull unit=3 ; @5.5 put unit=1 socket=A"
     )
-    assert told(story).text == ""
+    assert noted(story).text == ""
     monkeypatch.setattr(Continuity, "_lose", lambda *_: None)
-    assert told(story).kind == "NUMBER"
+    assert noted(story).kind == "NUMBER"
 
 
 # -- faults that the oracle has to find, beside those of `tests.campaigns.line_bugs` ---------------
 
 
-def report_nobody_after_a_run(patch: pytest.MonkeyPatch) -> None:
+def report_no_unit_after_a_run(patch: pytest.MonkeyPatch) -> None:
     begin, change = Presence.begin, Presence.change
 
     def begin_again(self: Presence) -> None:
@@ -778,7 +778,7 @@ def expect_a_start_until_the_first_answer(patch: pytest.MonkeyPatch) -> None:
             STORIES["pulled in its first answer"],
             "FALSE PASS",
         ),
-        (report_nobody_after_a_run, PASSED_AND_EXCHANGED, "GREEN"),
+        (report_no_unit_after_a_run, PASSED_AND_EXCHANGED, "GREEN"),
         (accuse_everybody, PASSED_AND_EXCHANGED, "ACCUSED"),
         (write_and_fail, PASSED_AND_EXCHANGED, "STUCK"),
         (never_begin, PASSED_AND_EXCHANGED, "STUCK"),
@@ -792,13 +792,13 @@ def test_a_fault_of_the_station_is_found(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     plant(monkeypatch)
-    assert told(story).kind == kind
+    assert noted(story).kind == kind
 
 
 def test_a_story_is_shrunk_to_what_it_needs() -> None:
     (bug,) = (each for each in read_bugs() if each.name == "one-card-for-all")
     with swapped(bug.codes()):
-        found = told(CARD_HERE_LABEL_THERE.replace("@4.0", "@2.5 free by=al socket=A ; @4.137"))
+        found = noted(CARD_HERE_LABEL_THERE.replace("@4.0", "@2.5 free by=al socket=A ; @4.137"))
         assert found.kind == bug.kind
         story = shrink(found).story
     assert [each.NAME for each in story.acts] == ["put", "card", "label"]

@@ -392,9 +392,9 @@ def test_a_pin_is_in_no_event_record_log_or_repr(
     line.scan(WRONG)
     line.scan(PIN)
     line.scan(PIN)  # once too often
-    said = [repr(each) for each in line.events] + [repr(CheckPin(Pin(PIN), "hash"))]
+    reported = [repr(each) for each in line.events] + [repr(CheckPin(Pin(PIN), "hash"))]
     for secret in (PIN, WRONG):
-        assert secret not in "\n".join(said)
+        assert secret not in "\n".join(reported)
         assert secret not in caplog.text
         files = [path for path in bench.folder.rglob("*") if path.is_file()]
         assert all(secret.encode() not in path.read_bytes() for path in files)
@@ -494,9 +494,9 @@ def test_what_is_wrong_with_a_table_is_reported(bench: Bench, old: str, new: str
     assert old in whole
     with pytest.raises(UsageError) as refused:
         loaded(bench, whole.replace(old, new, 1))
-    said = f"{refused.value} {refused.value.remedy} {refused.value.faults}"
-    assert why in said
-    assert "470815" not in said, "somebody wrote the PIN itself"
+    reported = f"{refused.value} {refused.value.remedy} {refused.value.faults}"
+    assert why in reported
+    assert "470815" not in reported, "somebody wrote the PIN itself"
 
 
 def test_a_missing_table_is_reported(bench: Bench) -> None:

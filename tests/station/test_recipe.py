@@ -33,7 +33,7 @@ manufacturer = true
 """
 
 
-def said(folder: Path, text: str) -> str:
+def reported(folder: Path, text: str) -> str:
     """Everything that is wrong with a recipe, as text."""
     with pytest.raises(UsageError) as caught:
         load_checked(write_recipe(folder, text), DAY)
@@ -114,11 +114,11 @@ def test_a_good_recipe_is_read_with_its_images(tmp_path: Path) -> None:
 )
 def test_what_is_wrong_with_a_recipe_is_named(tmp_path: Path, change: object, finding: str) -> None:
     assert callable(change)
-    assert finding in said(tmp_path, change(USUAL))
+    assert finding in reported(tmp_path, change(USUAL))
 
 
 def test_all_findings_are_reported_at_once(tmp_path: Path) -> None:
-    text = said(tmp_path, "x = 1\ny = 2\n" + USUAL.replace('revision = "4"', ""))
+    text = reported(tmp_path, "x = 1\ny = 2\n" + USUAL.replace('revision = "4"', ""))
     assert text.count("unknown key") == 2
     assert "has no revision" in text
 
@@ -126,7 +126,7 @@ def test_all_findings_are_reported_at_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["/etc/passwd", "../bms.bin", "a/../../b", "C:\\x", "\\\\h\\x"])
 def test_a_recipe_reaches_nothing_outside_of_its_folder(tmp_path: Path, name: str) -> None:
     text = USUAL.replace('image = "bms.bin"', f"image = '{name}'")
-    assert "is outside of the recipe's folder" in said(tmp_path, text)
+    assert "is outside of the recipe's folder" in reported(tmp_path, text)
 
 
 def test_a_link_out_of_the_folder_is_refused(tmp_path: Path) -> None:
@@ -184,7 +184,7 @@ def test_a_profile_of_the_working_directory_does_not_matter(
 
 def test_a_device_without_an_upgrade_is_reported_before_the_line_runs(tmp_path: Path) -> None:
     (tmp_path / "own.toml").write_text("[bms]\nhas_upgrade = false\n")
-    assert "has no upgrade" in said(tmp_path, "profile = 'own.toml'\n" + USUAL)
+    assert "has no upgrade" in reported(tmp_path, "profile = 'own.toml'\n" + USUAL)
 
 
 def test_a_profile_of_the_recipe_gives_the_version_query(tmp_path: Path) -> None:

@@ -222,16 +222,16 @@ def test_a_certificate_reports_what_was_written_and_how_far_it_was_verified(plan
 def test_the_code_on_the_paper_states_record_and_signed_row(
     plant: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    said: list[str] = []
+    reported: list[str] = []
     make = segno.make
 
     def listening(text: str, **options: Any) -> Any:
-        said.append(text)
+        reported.append(text)
         return make(text, **options)
 
     monkeypatch.setattr("segno.make", listening)
     html = page(plant, "W2605003")
-    lines = dict(line.split(" ", 1) for line in said[0].splitlines())
+    lines = dict(line.split(" ", 1) for line in reported[0].splitlines())
     run_id = plant.store.read.unit("W2605003").runs[-1].run.run_id
     head = plant.store.read.head_of(run_id)
     assert head is not None

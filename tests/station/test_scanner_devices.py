@@ -70,7 +70,7 @@ class Reading:
 
     def __init__(self, stack: ExitStack, path: str, socket: str) -> None:
         self.scans: list[tuple[str, str]] = []
-        self.said: list[StationEvent] = []
+        self.reported: list[StationEvent] = []
         self._came = threading.Condition()
         config = ScannerConfig(name=socket, input=path, socket=socket)
         scanner = Scanner(config, lambda *scan: self._add(self.scans, scan), self._hear)
@@ -82,14 +82,14 @@ class Reading:
             self._came.notify_all()
 
     def _hear(self, event: StationEvent) -> None:
-        self._add(self.said, event)
+        self._add(self.reported, event)
 
-    def wait(self, *, said: int = 0, scans: int = 0) -> None:
+    def wait(self, *, reported: int = 0, scans: int = 0) -> None:
         with self._came:
             is_there = self._came.wait_for(
-                lambda: len(self.said) >= said and len(self.scans) >= scans, LIMIT_S
+                lambda: len(self.reported) >= reported and len(self.scans) >= scans, LIMIT_S
             )
-        assert is_there, (len(self.scans), self.said[-3:])
+        assert is_there, (len(self.scans), self.reported[-3:])
 
 
 def test_500_scans_of_two_scanners_at_full_speed(stack: ExitStack) -> None:
@@ -100,7 +100,7 @@ def test_500_scans_of_two_scanners_at_full_speed(stack: ExitStack) -> None:
     }
     threads = []
     for name, each in plugged.items():
-        reading[name].wait(said=1)
+        reading[name].wait(reported=1)
         texts = wanted[name]
         threads.append(threading.Thread(target=lambda p=each, t=texts: [p.scan(x) for x in t]))
     begun = time.perf_counter()
@@ -113,7 +113,7 @@ def test_500_scans_of_two_scanners_at_full_speed(stack: ExitStack) -> None:
     print(f"{2 * SCANS} scans in {time.perf_counter() - begun:.1f} s")  # noqa: T201
     for name, each in plugged.items():
         assert reading[name].scans == [(text, name) for text in wanted[name]]
-        assert reading[name].said == [ScannerChanged(name, is_ready=True)]
+        assert reading[name].reported == [ScannerChanged(name, is_ready=True)]
         each.unplug()
 
 
@@ -121,7 +121,7 @@ def test_no_one_else_gets_its_keys(stack: ExitStack) -> None:
     plugged = Plugged("scanner")
     other = importlib.import_module("evdev").InputDevice(plugged.path)
     reading = Reading(stack, plugged.path, "A")
-    reading.wait(said=1)
+    reading.wait(reported=1)
     plugged.scan("BAT2620-0001")
     reading.wait(scans=1)
     assert other.read_one() is None
@@ -134,17 +134,17 @@ def test_no_one_else_gets_its_keys(stack: ExitStack) -> None:
 def test_it_is_unplugged_in_a_scan_and_comes_back(stack: ExitStack) -> None:
     plugged = Plugged("scanner")
     reading = Reading(stack, plugged.path, "A")
-    reading.wait(said=1)
+    reading.wait(reported=1)
     plugged.scan("BAT2620-0001")
     plugged._key(KEYS["B"][0], 1)
     plugged.unplug()
-    reading.wait(said=3, scans=1)
+    reading.wait(reported=3, scans=1)
     again = Plugged("scanner")
     assert again.path == plugged.path
-    reading.wait(said=4)
+    reading.wait(reported=4)
     again.scan("BAT2620-0002")
     reading.wait(scans=2)
     assert reading.scans == [("BAT2620-0001", "A"), ("BAT2620-0002", "A")]
-    states = [event.is_ready for event in reading.said if isinstance(event, ScannerChanged)]
+    states = [event.is_ready for event in reading.reported if isinstance(event, ScannerChanged)]
     assert (states[0], states[-1], set(states[1:-1])) == (True, True, {False})
     again.unplug()

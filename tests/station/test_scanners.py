@@ -190,10 +190,10 @@ class Desk:
 
     def __init__(self, socket: str = "", name: str = "left") -> None:
         self.plugged: FakeInput | None = None
-        self.said: list[StationEvent] = []
+        self.reported: list[StationEvent] = []
         self.scans: list[tuple[str, str]] = []
         config = ScannerConfig(name=name, input="/dev/input/event7", socket=socket)
-        self.scanner = Scanner(config, self._take, self.said.append, self._open)
+        self.scanner = Scanner(config, self._take, self.reported.append, self._open)
 
     def _take(self, text: str, source: Source) -> None:
         assert source.name == f"scanner {self.scanner.config.name}"
@@ -221,11 +221,11 @@ def test_a_scanner_that_is_missing_is_reported_once_and_opened_when_it_comes() -
     assert not desk.scanner.step(0.0)
     assert not desk.scanner.step(0.0)
     missing = ScannerChanged("left", is_ready=False, reason="No such file or directory")
-    assert desk.said == [missing]
+    assert desk.reported == [missing]
     device = desk.plug()
     device.type(*typed("W2605002"))
     assert desk.scanner.step(0.0)
-    assert desk.said[1:] == [ScannerChanged("left", is_ready=True)]
+    assert desk.reported[1:] == [ScannerChanged("left", is_ready=True)]
     assert desk.scans == [("W2605002", "")]
     desk.scanner.close()
 
@@ -240,8 +240,11 @@ def test_an_unplugged_scanner_is_reported_and_its_half_scan_goes_nowhere() -> No
     assert not desk.scanner.step(0.0)
     gone = ScannerChanged("left", is_ready=False, reason="No such device")
     again = ScannerChanged("left", is_ready=False, reason="No such file or directory")
-    assert [event for event in desk.said[1:] if isinstance(event, ScannerChanged)] == [gone, again]
-    refused = next(event for event in desk.said if isinstance(event, ScanRefused))
+    assert [event for event in desk.reported[1:] if isinstance(event, ScannerChanged)] == [
+        gone,
+        again,
+    ]
+    refused = next(event for event in desk.reported if isinstance(event, ScanRefused))
     assert (refused.code, refused.socket) == ("DAMAGED", "A")
     desk.plug().type(*typed("W2605002"))
     desk.scanner.step(0.0)
@@ -260,7 +263,7 @@ def test_an_error_of_a_library_is_a_scanner_that_is_gone(monkeypatch: pytest.Mon
     device.type()
     assert not desk.scanner.step(0.0)
     lost = ScannerChanged("left", is_ready=False, reason="Inappropriate ioctl")
-    assert desk.said[-1] == lost
+    assert desk.reported[-1] == lost
     assert desk.plug().is_grabbed
     desk.scanner.close()
 
@@ -299,7 +302,7 @@ def test_500_scans_of_two_scanners_in_pieces() -> None:
             if len(desk.scans) == before:
                 break
         assert desk.scans == [(text, name) for text in wanted[name]]
-        assert desk.said == [ScannerChanged(name, is_ready=True)]
+        assert desk.reported == [ScannerChanged(name, is_ready=True)]
         desk.scanner.close()
 
 
@@ -327,10 +330,10 @@ def test_a_scanner_is_found_by_its_place_on_the_usb(tmp_path: Path) -> None:
 @pytest.mark.skipif(os.name == "nt", reason="terminals of POSIX")
 def test_a_serial_scanner_in_pieces_and_unplugged() -> None:
     master, slave = os.openpty()
-    said: list[StationEvent] = []
+    reported: list[StationEvent] = []
     scans: list[tuple[str, str]] = []
     config = ScannerConfig(name="right", port=os.ttyname(slave), socket="B")
-    scanner = Scanner(config, lambda text, at: scans.append((text, at.socket)), said.append)
+    scanner = Scanner(config, lambda text, at: scans.append((text, at.socket)), reported.append)
     assert scanner.step(0.0)
     for piece in (b"W26", b"05002\r", b"\nW2605003\r\nW26", b"05004\t"):
         os.write(master, piece)
@@ -338,7 +341,10 @@ def test_a_serial_scanner_in_pieces_and_unplugged() -> None:
     assert scans == [("W2605002", "B"), ("W2605003", "B"), ("W2605004", "B")]
     os.close(master)
     assert not scanner.step(0.0)
-    assert [event.is_ready for event in said if isinstance(event, ScannerChanged)] == [True, False]
+    assert [event.is_ready for event in reported if isinstance(event, ScannerChanged)] == [
+        True,
+        False,
+    ]
     os.close(slave)
     assert not scanner.step(0.0), "it is not there"
 
@@ -476,9 +482,9 @@ def test_500_labels_at_the_speed_of_a_scanner_go_where_they_belong(bench: Bench)
         label, socket = wanted[-1]
         line.station.submit(label, scanner_at(socket))
     line.turn()
-    said = [
+    reported = [
         (event.text, event.socket) for event in line.of(ScanAccepted) if event.meaning == "label"
     ]
-    assert said == wanted
+    assert reported == wanted
     last = {socket: label for label, socket in wanted}
     assert {name: line.station.line.sockets[name].label for name in "ABCD"} == last

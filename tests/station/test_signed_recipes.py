@@ -100,10 +100,10 @@ def test_an_unsigned_image_is_refused_where_a_trust_file_is(
     tmp_path: Path, maker: Maker, signature: str
 ) -> None:
     assert maker
-    said = refused(recipe_with(tmp_path, table(signature, "bms.bin")))
-    assert "bms.bin is not signed." in said
-    assert "signature = 'waived'" in said
-    assert "--allow" not in said
+    reported = refused(recipe_with(tmp_path, table(signature, "bms.bin")))
+    assert "bms.bin is not signed." in reported
+    assert "signature = 'waived'" in reported
+    assert "--allow" not in reported
 
 
 def test_a_required_signature_is_required_without_a_trust_file(
@@ -128,9 +128,9 @@ def test_a_release_by_a_revoked_key_is_refused(tmp_path: Path, maker: Maker) -> 
     raw = released(maker, tmp_path)
     maker.next_version(keys=trusted("root a", "root b", "bert"), release={"bms": role("bert")})
     TrustStore().install(maker.chain)
-    said = refused(recipe_with(tmp_path, table(), raw))
-    assert "0 of the 1 signatures" in said
-    assert "(anna) was revoked" in said
+    reported = refused(recipe_with(tmp_path, table(), raw))
+    assert "0 of the 1 signatures" in reported
+    assert "(anna) was revoked" in reported
 
 
 def test_a_release_for_another_target_is_refused(tmp_path: Path, maker: Maker) -> None:

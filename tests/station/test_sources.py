@@ -50,18 +50,21 @@ class Unit:
     own: str = ""
     has_application: bool = True
     power_at: float = 0.0
-    said: int = 0
+    reported: int = 0
     """Announcements since its power came."""
 
     def put_in(self, now: float) -> None:
-        self.power_at, self.said = now, 0
+        self.power_at, self.reported = now, 0
 
     def frames(self, now: float) -> list[Message]:
         """What it sends in this step."""
         age = now - self.power_at
         if age < STARTS_AFTER_S or not self.has_application:
             due = int(age / 0.05)
-            self.said, announces = due, due > self.said and (due <= 4 or not self.has_application)
+            self.reported, announces = (
+                due,
+                due > self.reported and (due <= 4 or not self.has_application),
+            )
             return [BootVersion("BMS", "V1.0.0").to_message(BMS.answer_id)] if announces else []
         if round(age / STEP_S) % 5:
             return []
@@ -368,8 +371,8 @@ def test_what_was_dropped_is_shown_for_a_while(recipe: LoadedRecipe) -> None:
     floor.put_all(*pair())
     floor.scan("SOCKET A")
     floor.change_places(0.5)
-    said = "The unit was exchanged, or had no power. Check which unit it is, then scan again."
-    assert floor.text("A").startswith(said)
+    reported = "The unit was exchanged, or had no power. Check which unit it is, then scan again."
+    assert floor.text("A").startswith(reported)
     floor.go_on(15.0)
     assert floor.text("A") == "Scan the label of the unit and SOCKET A."
     floor.scan("SOCKET A")

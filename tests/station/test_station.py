@@ -204,9 +204,9 @@ def test_a_unit_in_another_socket_than_named_is_not_begun(line: LineBench) -> No
     line.scan(SERIAL)
     assert line.last(OperatorPrompted).text == f"Put {SERIAL} into socket A."
     line.arrive("B")
-    said = line.last(OperatorPrompted)
-    assert said.socket == "B"
-    assert said.text.startswith(f"Wrong socket: {SERIAL} goes into socket A.")
+    reported = line.last(OperatorPrompted)
+    assert reported.socket == "B"
+    assert reported.text.startswith(f"Wrong socket: {SERIAL} goes into socket A.")
     assert line.of(RunStarted) == []
     line.scan("SOCKET B")
     line.scan(SERIAL)
@@ -296,7 +296,7 @@ def test_a_label_without_its_unit_is_forgotten(line: LineBench) -> None:
     for _ in range(13):  # processes beat meanwhile
         line.bench.clock.go_on(9.5)
         for port in line.ports.values():
-            port.said.append(Beat())
+            port.reported.append(Beat())
         line.turn()
     assert line.last(ScanRefused).code == "FORGOTTEN"
     line.arrive("A")
@@ -321,7 +321,7 @@ def test_scans_that_waited_while_their_unit_was_exchanged_are_refused(
         line.station.submit(scan)
     bench.clock.go_on(3.0)
     if is_exchanged:
-        line.ports["A"].said += [
+        line.ports["A"].reported += [
             PresenceChanged(is_there=False, number=1),
             PresenceChanged(is_there=True, how="traffic", serial="", number=2),
         ]
@@ -791,7 +791,7 @@ def test_a_process_that_hangs_is_ended_and_started_again(line: LineBench) -> Non
 
 
 def test_a_process_that_cannot_work_is_not_started_again(line: LineBench) -> None:
-    line.ports["A"].said.append(AdapterDown("The recipe was changed.", is_final=True))
+    line.ports["A"].reported.append(AdapterDown("The recipe was changed.", is_final=True))
     line.ports["A"].is_gone = True
     line.turn()
     line.bench.clock.go_on(5.0)
@@ -961,8 +961,8 @@ def test_cause_and_action_are_two_sentences(line: LineBench, bench: Bench) -> No
     line.scan(SERIAL)
     line.arrive("A")
     line.end("A", RunState.FAIL, "LIMIT")
-    said = bench.store.read.unit(SERIAL).runs[-1].run.text
-    assert said.startswith("what happened. Put the unit aside")
+    reported = bench.store.read.unit(SERIAL).runs[-1].run.text
+    assert reported.startswith("what happened. Put the unit aside")
 
 
 def test_real_sockets_refuse_records_of_virtual_units(bench: Bench) -> None:
@@ -998,9 +998,9 @@ def test_what_is_not_saved_is_reported_in_one_line(line: LineBench, bench: Bench
     bench.path.rename(away)
     line.end("A")
     assert line.state("A") is SocketState.ERROR
-    told = line.last(RecordNotSaved)
-    assert "\n" not in told.reason
-    assert told.remedy not in told.reason
+    noted = line.last(RecordNotSaved)
+    assert "\n" not in noted.reason
+    assert noted.remedy not in noted.reason
     away.rename(bench.path)
     line.scan("RESUME")
     assert line.station.line.stopped is None

@@ -87,11 +87,11 @@ def test_a_power_command_that_fails_is_reported_when_it_is_looked_at() -> None:
 
 
 @each(
-    "template, said",
+    "template, reported",
     [("false {on|off}", "exit code 1"), ("no-such-command {on|off}", "cannot be run")],
 )
-def test_a_real_power_command_that_does_not_work(template: str, said: str) -> None:
+def test_a_real_power_command_that_does_not_work(template: str, reported: str) -> None:
     power = PowerCommand(template, sleep=lambda _s: None)
     power.begin_cycle()
-    with pytest.raises(BusError, match=said):
+    with pytest.raises(BusError, match=reported):
         power.check()

@@ -23,7 +23,7 @@ ACK_BEGINS = Frame(0x725, bytes.fromhex("55AA0C04C2020700"))
 """The first of the two frames of ACK 7 of a BMS."""
 
 
-def told(tape: Tape, until: float | None = None) -> Story:
+def printed(tape: Tape, until: float | None = None) -> Story:
     return explain(tape, source="trace", until=until)
 
 
@@ -287,7 +287,7 @@ def test_every_cause_is_named_with_its_phase_and_packet(
 ) -> None:
     tape = Tape()
     write(tape)
-    verdict = told(tape).verdict
+    verdict = printed(tape).verdict
     assert (verdict.cause, verdict.phase, verdict.packet) == (cause, phase, packet), verdict.text
     assert verdict.text.endswith(".")
     assert bool(verdict.remedy) is not cause.is_good
@@ -306,7 +306,7 @@ def test_every_format_reports_the_same(suffix: str, tmp_path: Path) -> None:
     assert (story.verdict.cause, story.verdict.packet) == (Cause.PACKET_REFUSED, 7)
     assert story.format == suffix[1:]
     assert story.frames == len(tape.frames)
-    measured, exact = story.upgrades[0].link, told(tape).upgrades[0].link
+    measured, exact = story.upgrades[0].link, printed(tape).upgrades[0].link
     assert measured is not None
     assert exact is not None
     assert measured.transfer_s == pytest.approx(exact.transfer_s, abs=2e-6)
@@ -353,7 +353,7 @@ def test_the_bytes_of_the_documents_are_understood(tmp_path: Path) -> None:
 
 def test_good_packets_are_one_line_and_the_bad_one_has_its_own() -> None:
     tape = Tape().to_packet(4).packet(4).nak(4).packet(4).ack(4).packets(5, 10).end().complete()
-    (upgrade,) = told(tape).upgrades
+    (upgrade,) = printed(tape).upgrades
     lines = upgrade.steps[5:-2]
     runs = [(line.first, line.last) for line in lines if isinstance(line, PacketRun)]
     assert runs == [(1, 3), (4, 10)]
@@ -374,7 +374,7 @@ def test_every_message_is_a_line_when_everything_is_wanted() -> None:
 @pytest.mark.slow
 def test_long_trouble_is_cut_in_the_middle_and_counted() -> None:
     tape = refused(Tape().to_packet(7), 700)
-    (upgrade,) = told(tape).upgrades
+    (upgrade,) = printed(tape).upgrades
     assert len(upgrade.steps) == 1000
     assert upgrade.steps_left_out == 1400 + 6 - 1000
 
@@ -386,7 +386,7 @@ def test_several_upgrades_and_targets_are_distinguished() -> None:
     wmc.to_end().complete()
     again = Tape("bms")
     again.now, again.frames = wmc.now + 30, tape.frames
-    story = told(again.to_end().complete())
+    story = printed(again.to_end().complete())
     assert [(one.target, one.verdict.cause) for one in story.upgrades] == [
         ("BMS", Cause.REFUSED),
         ("WMC", Cause.COMPLETED),
@@ -397,7 +397,7 @@ def test_several_upgrades_and_targets_are_distinguished() -> None:
 
 def test_the_last_upgrade_of_each_target_makes_the_verdict() -> None:
     tape = Tape().to_end().complete().wait(20).reset(5)
-    assert told(tape).verdict.cause is Cause.NO_BOOT_VERSION
+    assert printed(tape).verdict.cause is Cause.NO_BOOT_VERSION
 
 
 def test_an_update_command_into_silence_is_an_attempt_as_flash_counts_it() -> None:
@@ -405,16 +405,16 @@ def test_an_update_command_into_silence_is_an_attempt_as_flash_counts_it() -> No
     tape = Tape().to_packet(5).packet(5).wait(0.6).packet(5).wait(0.6)
     tape.reset(5).wait(5.2).reset(5).wait(10.0)
     tape.update().request().packets(1, 10).end().complete()
-    (upgrade,) = told(tape).upgrades
+    (upgrade,) = printed(tape).upgrades
     assert upgrade.attempts == 4
     tape = Tape().reset(5).feedback().boot().update().wait(0.05).boot().update().request()
-    (upgrade,) = told(tape.packets(1, 10).end().complete()).upgrades
+    (upgrade,) = printed(tape.packets(1, 10).end().complete()).upgrades
     assert upgrade.attempts == 1
 
 
 def test_a_restart_that_was_overcome_is_a_remark_and_an_attempt() -> None:
     tape = Tape().to_packet(7).packet(7).wait(0.1).boot().update().wait(0.02).request()
-    (upgrade,) = told(tape.packets(1, 10).end().complete()).upgrades
+    (upgrade,) = printed(tape.packets(1, 10).end().complete()).upgrades
     assert upgrade.verdict.cause is Cause.COMPLETED
     assert upgrade.attempts == 2
     assert upgrade.remarks == ("the device restarted in the transfer once",)
@@ -424,14 +424,14 @@ def test_a_restart_that_was_overcome_is_a_remark_and_an_attempt() -> None:
 
 def test_announcements_just_before_the_update_command_belong_to_the_upgrade() -> None:
     tape = Tape().boot().wait(0.05).boot().update().wait(0.02).request().packets(1, 10)
-    (upgrade,) = told(tape.end().complete()).upgrades
+    (upgrade,) = printed(tape.end().complete()).upgrades
     assert upgrade.boot_version == "BMS V1.2.3"
     assert upgrade.begin_s == pytest.approx(0.0)
 
 
 def test_a_bus_that_was_listened_to_longer_shows_more_than_its_last_frame() -> None:
     tape = Tape().to_packet(7)
-    assert told(tape, until=tape.now + 5).verdict.cause is Cause.TOOL_STOPPED
+    assert printed(tape, until=tape.now + 5).verdict.cause is Cause.TOOL_STOPPED
 
 
 def test_the_next_unit_of_a_series_does_not_judge_the_one_before() -> None:
@@ -440,7 +440,7 @@ def test_the_next_unit_of_a_series_does_not_judge_the_one_before() -> None:
         tape.tool(0x3300, b"", READ).version(OLD, serial).wait(0.1)
         with_version(tape).complete().wait(0.3).tool(0x3300, b"", READ).version(NEW, serial)
         tape.wait(40)
-    story = told(tape.tool(0x3300, b"", READ).version(OLD, b"W4"))
+    story = printed(tape.tool(0x3300, b"", READ).version(OLD, b"W4"))
     assert [upgrade.verdict.cause for upgrade in story.upgrades] == [Cause.COMPLETED] * 3
     assert [upgrade.running_version for upgrade in story.upgrades] == [NEW.decode()] * 3
     assert all(upgrade.end_s - upgrade.begin_s < 1 for upgrade in story.upgrades)
@@ -449,7 +449,7 @@ def test_the_next_unit_of_a_series_does_not_judge_the_one_before() -> None:
 
 @pytest.mark.parametrize("begins", [Tape().version(OLD, b"W1"), Tape().reset().version(OLD, b"W1")])
 def test_a_version_answer_of_another_unit_is_no_verification(begins: Tape) -> None:
-    (upgrade,) = told(with_version(begins).complete().wait(0.3).version(NEW, b"W2")).upgrades
+    (upgrade,) = printed(with_version(begins).complete().wait(0.3).version(NEW, b"W2")).upgrades
     assert upgrade.verdict.cause is Cause.COMPLETED
     assert upgrade.running_version is None
     assert upgrade.remarks == ("another unit answers after the end: serial number W2, not W1",)
@@ -457,11 +457,11 @@ def test_a_version_answer_of_another_unit_is_no_verification(begins: Tape) -> No
 
 def test_a_unit_that_falls_back_later_is_still_judged_by_its_last_answer() -> None:
     tape = with_version(Tape().version(OLD)).complete().wait(0.3).version(NEW).wait(5).version(OLD)
-    assert told(tape).verdict.cause is Cause.OTHER_VERSION
+    assert printed(tape).verdict.cause is Cause.OTHER_VERSION
 
 
 def test_hostile_texts_come_out_escaped() -> None:
-    story = told(Tape().reset().feedback().boot(b"\x1b[2J\r\n"))
+    story = printed(Tape().reset().feedback().boot(b"\x1b[2J\r\n"))
     assert story.verdict.cause is Cause.WRONG_DEVICE
     assert r"\x1b[2J\r\n" in story.verdict.text
     assert all(char.isprintable() for char in story.verdict.text + str(story.upgrades))
@@ -469,7 +469,7 @@ def test_hostile_texts_come_out_escaped() -> None:
 
 def test_silence_and_error_frames_are_steps() -> None:
     tape = Tape().to_boot().update().wait(3).error(4).request()
-    (upgrade,) = told(tape).upgrades
+    (upgrade,) = printed(tape).upgrades
     kinds = [(step.kind, step.title) for step in upgrade.steps if isinstance(step, Step)]
     assert (StepKind.ERROR_FRAMES, "error frames") in kinds
     assert (StepKind.GAP, "silence") in kinds
@@ -478,7 +478,7 @@ def test_silence_and_error_frames_are_steps() -> None:
 def test_others_are_reported_by_id_and_name() -> None:
     tape = Tape().to_end().complete().version(NEW)
     tape.frame(Frame(0x1FFFF, b"\x01", is_extended=True)).frame(Frame(0x123, b"\x01"))
-    talkers = {talker.can_id: talker for talker in told(tape).talkers}
+    talkers = {talker.can_id: talker for talker in printed(tape).talkers}
     assert set(talkers) == {0x720, 0x1FFFF, 0x123}
     assert talkers[0x720].name == "BMS > all"
     assert talkers[0x1FFFF].is_extended
@@ -488,7 +488,7 @@ def test_the_load_is_that_of_the_bits_on_the_wire() -> None:
     tape = Tape()
     for _ in range(2003):
         tape.frame(Frame(0x123, bytes.fromhex("AA" * 8)))
-    bus = told(tape).bus
+    bus = printed(tape).bus
     assert bus.duration_s == pytest.approx(1.001, abs=1e-4)
     assert bus.load == pytest.approx(2003 * 111 / 250_000, rel=0.03)
     assert bus.peak_load == pytest.approx(bus.load, rel=0.02)
@@ -496,14 +496,14 @@ def test_the_load_is_that_of_the_bits_on_the_wire() -> None:
 
 def test_a_trace_with_displays_and_no_upgrade_has_the_other_dialects_rate() -> None:
     tape = Tape().message(0x742, READ, 0x5000, b"")
-    assert told(tape).bitrate_bps == 125_000
+    assert printed(tape).bitrate_bps == 125_000
     assert explain(tape, source="", bitrate_bps=500_000).bitrate_bps == 500_000
 
 
 def test_times_that_go_back_count_as_the_same() -> None:
     tape = Tape().to_end().complete()
     tape.frames[30:] = [(at - 10, frame) for at, frame in tape.frames[30:]]
-    assert told(tape).verdict.cause is Cause.COMPLETED
+    assert printed(tape).verdict.cause is Cause.COMPLETED
 
 
 def test_a_file_that_was_cut_off_is_explained_up_to_there(tmp_path: Path) -> None:

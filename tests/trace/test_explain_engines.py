@@ -65,11 +65,11 @@ def test_the_verdict_is_the_hosts_outcome(
     tapped = Tapped()
     outcome = upgrade(ScriptedDevice("bms", script), traffic=tapped)
     assert outcome.ending is ending
-    (told,) = tapped.story().upgrades
-    assert told.verdict.cause is cause, told.verdict.text
-    assert told.attempts == outcome.statistics.attempts
+    (printed,) = tapped.story().upgrades
+    assert printed.verdict.cause is cause, printed.verdict.text
+    assert printed.attempts == outcome.statistics.attempts
     if outcome.packet is not None:
-        assert told.verdict.packet == outcome.packet
+        assert printed.verdict.packet == outcome.packet
 
 
 def test_live_and_recorded_figures_are_the_same() -> None:
@@ -78,14 +78,14 @@ def test_live_and_recorded_figures_are_the_same() -> None:
         ScriptedDevice("bms", DeviceScript(nak={7: 2}, drop_ack=frozenset({3}))), traffic=tapped
     )
     assert outcome.ok
-    (told,) = tapped.story().upgrades
+    (printed,) = tapped.story().upgrades
     report = tapped.meter.report()
     assert report is not None
-    assert told.link is not None
-    assert report.packets == told.link.packets == 10
+    assert printed.link is not None
+    assert report.packets == printed.link.packets == 10
     assert report.repetitions == outcome.statistics.repetitions == 3
     assert report.naks == outcome.statistics.naks == 2
-    assert report.transfer_s == pytest.approx(told.link.transfer_s)
+    assert report.transfer_s == pytest.approx(printed.link.transfer_s)
 
 
 def test_a_transfer_without_waiting_reaches_the_line_rate() -> None:

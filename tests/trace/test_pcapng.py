@@ -123,7 +123,7 @@ WHOLE = section() + interface() + packet()
 
 
 @pytest.mark.parametrize(
-    ("data", "said"),
+    ("data", "reported"),
     [
         (section() + interface(1) + packet(bytes(60)), "link type 1 (Ethernet), not 227"),
         (pcap("<", 0xA1B2C3D4, link_type=113), 'link type 113 (Linux "any"), not 227'),
@@ -146,11 +146,11 @@ WHOLE = section() + interface() + packet()
         (pcap("<", 0xA1B2C3D4)[:20], "does not begin as a capture"),
     ],
 )
-def test_what_cannot_be_read_is_reported_in_words(path: Path, data: bytes, said: str) -> None:
+def test_what_cannot_be_read_is_reported_in_words(path: Path, data: bytes, reported: str) -> None:
     path.write_bytes(data)
     with pytest.raises(UsageError) as caught:
         list(read_trace(path))
-    assert said in caught.value.cause
+    assert reported in caught.value.cause
 
 
 @pytest.mark.parametrize(

@@ -121,11 +121,11 @@ def test_a_file_that_is_something_else_is_wrong_usage(tmp_path: Path, suffix: st
         warnings.simplefilter("ignore", ResourceWarning)
         with pytest.raises(UsageError) as caught:
             list(read_trace(path))
-        code, said = caught.value.exit_code, str(caught.value)
+        code, reported = caught.value.exit_code, str(caught.value)
         del caught
         gc.collect()
     assert code == ExitCode.USAGE
-    assert str(path) in said
+    assert str(path) in reported
 
 
 def test_a_name_with_an_escape_sequence_is_shown_harmlessly(tmp_path: Path) -> None:

@@ -59,8 +59,8 @@ def test_a_log_is_what_candump_writes(tmp_path: Path) -> None:
         (3.0, False, Frame(0x725, b"", is_remote=True)),
         (4.0, False, Frame(0, b"", is_error=True)),
     )
-    said = [line.partition(") ")[2] for line in path.read_text(encoding="ascii").splitlines()]
-    assert said == [
+    reported = [line.partition(") ")[2] for line in path.read_text(encoding="ascii").splitlines()]
+    assert reported == [
         f"can0 752#{SENT.data.hex().upper()}",
         "can0 18DA00F1#01",
         "can0 725#R",

@@ -43,7 +43,9 @@ def only_tab(browser: Browser) -> Iterator[Tab]:
     tab = Tab(context.new_page())
     context.on("request", lambda request: tab.asked.append(request.url))
     tab.page.on("pageerror", lambda error: tab.wrong.append(str(error)))
-    tab.page.on("console", lambda said: tab.wrong.extend([said.text] * (said.type == "error")))
+    tab.page.on(
+        "console", lambda reported: tab.wrong.extend([reported.text] * (reported.type == "error"))
+    )
     yield tab
     context.close()
 

@@ -82,7 +82,7 @@ class Place:
             secret=secret,
             login=self.login,
         )
-        self.said: asyncio.Queue[str] = asyncio.Queue()
+        self.reported: asyncio.Queue[str] = asyncio.Queue()
         self.most_waiting = 0
 
     async def _page(self, request: Request) -> Response:
@@ -91,14 +91,14 @@ class Place:
     async def _events(self, request: Request) -> Response:
         async def messages() -> Any:
             while True:
-                yield {"said": await self.said.get()}
+                yield {"said": await self.reported.get()}
 
         return streamed(messages())
 
     def browser(self, address: str = "192.0.2.1") -> TestClient:
         return TestClient(self.app, base_url=URL, follow_redirects=False, client=(address, 50000))
 
-    def told(self, event: AuditEvent) -> list[dict[str, str]]:
+    def noted(self, event: AuditEvent) -> list[dict[str, str]]:
         """What the audit trail got of a kind."""
         return [data for kind, data in self.notes if kind is event]
 
@@ -162,7 +162,7 @@ def test_guessing_the_password_is_limited_for_who_guesses_alone() -> None:
     place.clock.go_on(PAUSE_S)
     assert sign_in(browser, password=ALL)[0] == 303
     why = {"name": "", "address": "192.0.2.1", "why": "wrong password"}
-    refused = place.told(AuditEvent.SIGN_IN_REFUSED)
+    refused = place.noted(AuditEvent.SIGN_IN_REFUSED)
     assert refused == [why] * 4 + [{**why, "pause": "60 s"}]
 
 
@@ -387,7 +387,7 @@ def test_what_was_typed_is_in_no_row_of_the_trail() -> None:
     supervised = place.browser()
     supervised.get("/runs")
     sign_in(supervised, badge="BADGE-1")
-    assert place.told(AuditEvent.SIGN_IN_REFUSED) == [
+    assert place.noted(AuditEvent.SIGN_IN_REFUSED) == [
         {"name": "", "address": "192.0.2.1", "why": "unknown badge"},
         {"name": "Sue", "address": "192.0.2.1", "why": "wrong PIN"},
         {"name": "Jo", "address": "192.0.2.1", "why": "no supervisor"},
@@ -407,7 +407,7 @@ def test_a_supervisor_who_left_is_asked_again() -> None:
     assert browser.head("/").status_code == 303
     assert status(browser) == 303
     assert status(browser, "/") == 303
-    ended = place.told(AuditEvent.SIGN_IN_ENDED)
+    ended = place.noted(AuditEvent.SIGN_IN_ENDED)
     assert [(each["name"], each["why"]) for each in ended] == [("Sue", "15 min without use")]
 
 
@@ -433,7 +433,7 @@ def test_every_sign_in_ends_after_a_shift(fields: dict[str, str]) -> None:
     assert status(browser, "/") == 200
     place.clock.go_on(1)
     assert status(browser, "/") == 303
-    assert [each["why"] for each in place.told(AuditEvent.SIGN_IN_ENDED)] == ["8 h"]
+    assert [each["why"] for each in place.noted(AuditEvent.SIGN_IN_ENDED)] == ["8 h"]
 
 
 @pytest.mark.slow
@@ -507,7 +507,7 @@ def test_who_signs_out_is_out_with_every_copy_of_the_cookie() -> None:
     copied.cookies.update(browser.cookies)
     assert posted(browser, "/sign-out") == (303, "/")
     assert status(browser) == status(copied) == status(copied, "/") == 303
-    (data,) = place.told(AuditEvent.SIGN_OUT)
+    (data,) = place.noted(AuditEvent.SIGN_OUT)
     assert (data["name"], data["address"]) == ("Sue", "192.0.2.1")
 
 
@@ -527,7 +527,7 @@ def test_everywhere_is_all_of_one_person() -> None:
     sign_in(rea, badge="BADGE-4", pin=PIN)
     posted(first, "/sign-out", everywhere="1")
     assert (status(first), status(second), status(rea, "/")) == (303, 303, 200)
-    (ended,) = place.told(AuditEvent.SIGN_IN_ENDED)
+    (ended,) = place.noted(AuditEvent.SIGN_IN_ENDED)
     assert (ended["address"], ended["by"]) == ("192.0.2.2", "Sue")
 
 
@@ -580,11 +580,11 @@ def test_a_stream_ends_with_its_sign_in() -> None:
             sent.append(message)
 
         looking: asyncio.Future[None] = asyncio.ensure_future(place.app(scope, receive, send))
-        place.said.put_nowait("before")
+        place.reported.put_nowait("before")
         while not any(b"before" in each.get("body", b"") for each in sent):
             await asyncio.sleep(0)
         place.login.sign_ins.end_all(place.login.sign_ins.listed()[0])
-        place.said.put_nowait("after")
+        place.reported.put_nowait("after")
         for _ in range(20):
             await asyncio.sleep(0)
         assert looking.done()
@@ -609,9 +609,9 @@ def test_a_supervisor_sees_who_is_there_and_ends_it() -> None:
     assert posted(rea, "/sign-ins/end", number="1") == (303, "/login")
     assert posted(sue, "/sign-ins/end", number="2") == (303, "/sign-ins")
     assert (status(rea, "/"), status(sue)) == (303, 200)
-    (ended,) = place.told(AuditEvent.SIGN_IN_ENDED)
+    (ended,) = place.noted(AuditEvent.SIGN_IN_ENDED)
     assert (ended["name"], ended["by"]) == ("Rea", "Sue")
-    assert [each["name"] for each in place.told(AuditEvent.SIGN_IN)] == ["Sue", "Rea"]
+    assert [each["name"] for each in place.noted(AuditEvent.SIGN_IN)] == ["Sue", "Rea"]
 
 
 @pytest.mark.slow

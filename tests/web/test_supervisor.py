@@ -184,9 +184,9 @@ def test_the_form_of_the_runs_narrows_them_and_its_files_are_of_the_same(
     files = _links(html)
     rows = list(csv.DictReader(io.StringIO(client.get(files["CSV"]).text)))
     assert [row["state"] for row in rows] == ["FAIL"] * 3
-    told = json.loads(client.get(files["JSON"]).text)
-    assert told["filter"]["state"] == "fail"
-    assert [run["serial"] for run in told["runs"]] == [row["serial"] for row in rows]
+    noted = json.loads(client.get(files["JSON"]).text)
+    assert noted["filter"]["state"] == "fail"
+    assert [run["serial"] for run in noted["runs"]] == [row["serial"] for row in rows]
     suite = ElementTree.fromstring(client.get(files["JUnit"]).content)  # noqa: S314  our own
     assert len(list(suite.iter("failure"))) == 3
 

@@ -26,15 +26,15 @@ def test_nothing_is_left_untranslated() -> None:
     for language in catalogue.LANGUAGES:
         known = catalogue.messages(language)
         assert everything == known.keys(), language
-        assert [english for english, said in known.items() if not said] == [], language
+        assert [english for english, reported in known.items() if not reported] == [], language
 
 
 @each("language", catalogue.LANGUAGES)
 def test_values_and_scans_stand_in_every_language(language: str) -> None:
-    for english, said in catalogue.messages(language).items():
-        assert catalogue.fields(said) == catalogue.fields(english), english
+    for english, reported in catalogue.messages(language).items():
+        assert catalogue.fields(reported) == catalogue.fields(english), english
         if "." in english:  # a sentence, not the name of a state
-            assert set(_CARDS.findall(said)) == set(_CARDS.findall(english)), english
+            assert set(_CARDS.findall(reported)) == set(_CARDS.findall(english)), english
 
 
 @pytest.mark.slow
@@ -48,8 +48,8 @@ def test_a_sentence_is_translated_by_its_template() -> None:
 
 
 def test_a_value_is_never_taken_for_a_template() -> None:
-    said = text("Scan {label}.", label="{socket} %s {0}")
-    assert translator("de")(said) == "{socket} %s {0} scannen."
+    reported = text("Scan {label}.", label="{socket} %s {0}")
+    assert translator("de")(reported) == "{socket} %s {0} scannen."
 
 
 def test_a_value_is_exchanged_at_any_place() -> None:
@@ -62,9 +62,9 @@ def test_a_value_is_exchanged_at_any_place() -> None:
 
 
 def test_a_sentence_passes_from_process_to_process() -> None:
-    said = pickle.loads(pickle.dumps(text("Connect {label}.", label="W1")))  # noqa: S301  our own
-    assert isinstance(said, Text)
-    assert translator("de")(said) == "W1 anschließen."
+    reported = pickle.loads(pickle.dumps(text("Connect {label}.", label="W1")))  # noqa: S301  our own
+    assert isinstance(reported, Text)
+    assert translator("de")(reported) == "W1 anschließen."
 
 
 def test_what_no_catalogue_knows_stays_as_it_is() -> None:

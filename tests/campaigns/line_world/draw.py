@@ -401,15 +401,15 @@ class Teller:
             yield 5.0, None
 
     def _go_on_with_one_alike(self, name: str) -> Iterator[Step]:
-        yield from self._go_on_in_an_outage(name, is_untold=True)
+        yield from self._go_on_in_an_outage(name, is_identical=True)
 
-    def _go_on_in_an_outage(self, name: str, *, is_untold: bool = False) -> Iterator[Step]:
+    def _go_on_in_an_outage(self, name: str, *, is_identical: bool = False) -> Iterator[Step]:
         """A socket stops to work after a PASS, and somebody goes on with the next unit there.
         `is_untold`: with two units that nobody can tell apart, if there are such.
         """
         bays = yield from self._bring(2)
-        if is_untold:
-            bays.sort(key=lambda bay: not self._is_untold(self._number(bay)))
+        if is_identical:
+            bays.sort(key=lambda bay: not self._is_identical(self._number(bay)))
         for bay in bays:
             unit = self._number(bay)
             yield self._pause(), stories.Card(by=name, unit=unit)
@@ -420,7 +420,7 @@ class Teller:
                 yield 0.5, None
             if label_of(unit) in self.world.passed:
                 yield self._pause(), None
-                yield from self._outage(bay.name, is_untold=is_untold)
+                yield from self._outage(bay.name, is_identical=is_identical)
                 yield 12.0, None  # nobody scans the next unit at once
                 return
 
@@ -451,17 +451,17 @@ class Teller:
         if bay.unit is not None:
             yield from self._put_another(bay)
 
-    def _is_untold(self, number: int) -> bool:
+    def _is_identical(self, number: int) -> bool:
         unit = self._setup(number)
         return unit.number in _UNTOLD and unit.application != "none"
 
-    def _put_another(self, bay: Bay, *, is_untold: bool = False) -> Iterator[Step]:
+    def _put_another(self, bay: Bay, *, is_identical: bool = False) -> Iterator[Step]:
         """`is_untold`: one that cannot be told from it, if there is one."""
         before = self._number(bay)
         yield 0.0, stories.Pull(unit=before)
         on_table = [each for each in self._on_table() if each != before]
-        untold = [each for each in on_table if is_untold and self._is_untold(each)]
-        others = [self._setup(each) for each in untold or on_table]
+        identical = [each for each in on_table if is_identical and self._is_identical(each)]
+        others = [self._setup(each) for each in identical or on_table]
         unit = before
         if others and self.chance.random() < 0.9:
             unit = self._another(self._setup(before), others).label
@@ -557,7 +557,7 @@ class Teller:
             else:
                 yield wait, stories.KillStation(seconds=1.0 + seconds)
 
-    def _outage(self, socket: str, *, is_untold: bool = False) -> Iterator[Step]:
+    def _outage(self, socket: str, *, is_identical: bool = False) -> Iterator[Step]:
         """An adapter that is away, or a process that dies again and again, and a unit that is
         exchanged meanwhile.
         """
@@ -572,4 +572,4 @@ class Teller:
             yield 1.3, stories.KillWorker(socket=bay.name)
             yield 2.3, stories.KillWorker(socket=bay.name)
         if bay.unit is not None:
-            yield from self._put_another(bay, is_untold=is_untold)
+            yield from self._put_another(bay, is_identical=is_identical)

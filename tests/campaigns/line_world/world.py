@@ -216,7 +216,7 @@ class World:
         """Labels whose PASS was shown."""
         people = (*setup.people, stories.Person(name=CAREFUL, source=CAREFUL))
         self.people = {each.name: PersonAtWork(each.name, each.source) for each in people}
-        self.promises = Promises(self._told_number)
+        self.promises = Promises(self._reported_number)
         self.station: Station | None = None
         self._station_at: float | None = None
         """When a station that died is started again."""
@@ -520,7 +520,7 @@ class World:
     def _setup_of(self, unit: int) -> stories.UnitSetup:
         return next(each for each in self.setup.units if each.label == unit)
 
-    def _told_number(self, unit: PaperUnit) -> str | None:
+    def _reported_number(self, unit: PaperUnit) -> str | None:
         """What a unit answers that it is; None when it answers nothing."""
         number = next(number for number, each in self.units.items() if each is unit)
         return _stored(unit).number if self._setup_of(number).answers else None
@@ -648,11 +648,11 @@ class World:
         self.station.submit(text, Source(name, mounted))
         self.turn()
         self._scanning = None
-        said = self._answers[before:]
+        reported = self._answers[before:]
         if text == "CANCEL":
             for each in self._sharing(person):
                 each.card = each.label = None
-        return any(isinstance(each, ScanAccepted) and each.text == text for each in said)
+        return any(isinstance(each, ScanAccepted) and each.text == text for each in reported)
 
     def _sleep(self, act: stories.Sleep) -> bool:
         unit, bay = self.units.get(act.unit), self.where(act.unit)
@@ -918,7 +918,7 @@ class World:
         self.go_to(round(self.now + seconds, 6))
 
     def _bring_home(self, number: int) -> Iterator[stories.Act]:
-        label, said = label_of(number), ""
+        label, reported = label_of(number), ""
         for attempt in range(_TRIES):
             self._await_ends()
             yield from self._empty()
@@ -942,13 +942,13 @@ class World:
             refusals = [e for e in self._answers[before:] if isinstance(e, ScanRefused)]
             if any(each.code in _FINAL for each in refusals):
                 return
-            said = "; ".join(f"{e.code} {e.reason} {e.remedy}" for e in refusals)
+            reported = "; ".join(f"{e.code} {e.reason} {e.remedy}" for e in refusals)
             if self.seen["runs"] > runs:
                 self._await_ends()
                 if label in self.passed or not self._has_to_pass(number):
                     return
-                said = f"its run ended with {self._last_end}"
-        self._stuck(number, said)
+                reported = f"its run ended with {self._last_end}"
+        self._stuck(number, reported)
 
     def _empty(self) -> Iterator[stories.Act]:
         """Nothing waits for a scan, and no unit is in a socket."""
@@ -970,8 +970,8 @@ class World:
             return True
         return unit.answers and unit.number in numbers
 
-    def _stuck(self, number: int, said: str) -> NoReturn:
-        raise Violation(STUCK, f"no way of scans leads {label_of(number)} to its end: {said}")
+    def _stuck(self, number: int, reported: str) -> NoReturn:
+        raise Violation(STUCK, f"no way of scans leads {label_of(number)} to its end: {reported}")
 
     def _await_ends(self) -> None:
         give_up_at = self.now + _RUN_LIMIT_S

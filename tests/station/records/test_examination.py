@@ -13,7 +13,7 @@ from flasher.station.records import chain, examination, heads
 from flasher.station.records.model import Examination, RunId, RunState
 from flasher.station.records.store import Store
 from tests.station.factory import Bench
-from tests.station.records.test_places import forging, make_anew, told
+from tests.station.records.test_places import forging, make_anew, noted
 
 OTHER = "W2605003"
 
@@ -104,14 +104,14 @@ def test_what_was_changed_since_is_reported(
     changed(examined, statement)
     found = go_on(examined)
     assert found.since is not None
-    assert told(found.problems, where, what), found.problems
-    assert told(go_on(examined).problems, where, what)  # and is not forgotten
+    assert noted(found.problems, where, what), found.problems
+    assert noted(go_on(examined).problems, where, what)  # and is not forgotten
 
 
 def test_what_was_changed_before_is_reported_by_a_whole_examination(examined: Bench) -> None:
     changed(examined, "UPDATE run SET text = 'all was well' WHERE id = 1")
     assert not go_on(examined).problems
-    assert told(examined.store.examine().problems, "run 1", "the run itself")
+    assert noted(examined.store.examine().problems, "run 1", "the run itself")
 
 
 @pytest.mark.parametrize(

@@ -116,7 +116,7 @@ def examined(
         return store.examine().problems
 
 
-def told(problems: tuple[Problem, ...], where: str, what: str) -> bool:
+def noted(problems: tuple[Problem, ...], where: str, what: str) -> bool:
     return any(where in each.where and what in each.what for each in problems)
 
 
@@ -161,7 +161,7 @@ def test_a_changed_row_is_found(
     plant: Bench, tmp_path: Path, statement: str, where: str, what: str
 ) -> None:
     problems = examined(plant, tmp_path, lambda forger, _: forger(statement))
-    assert told(problems, where, what), problems
+    assert noted(problems, where, what), problems
 
 
 def to_pass(forger: Forger, folder: Path) -> None:
@@ -185,10 +185,10 @@ def test_a_fail_that_became_a_pass_in_a_recomputed_chain_is_reported(
         forger.recompute()
 
     problems = examined(plant, tmp_path, forge)
-    assert told(problems, "audit row 8 of line-2", "not signed with the key of the station")
-    assert told(problems, "audit trail of line-2", "the chain was replaced")
-    assert told(problems, f"run 3, PASS of {FAILED}", f"it is the trace of {OTHER}")
-    assert told(problems, "runs 2, 3", "the same trace")
+    assert noted(problems, "audit row 8 of line-2", "not signed with the key of the station")
+    assert noted(problems, "audit trail of line-2", "the chain was replaced")
+    assert noted(problems, f"run 3, PASS of {FAILED}", f"it is the trace of {OTHER}")
+    assert noted(problems, "runs 2, 3", "the same trace")
 
 
 def test_a_chain_signed_anew_with_another_key_is_found_by_the_kept_heads(
@@ -249,19 +249,19 @@ def test_a_pass_with_the_trace_of_something_else_is_reported(bench: Bench) -> No
     }
     for serial, (messages, what) in traces.items():
         run_id = passed(bench, serial, write_trace(folder / f"{serial}.log.gz", messages))
-        assert told(bench.store.examine().problems, f"run {run_id}, PASS of {serial}", what)
+        assert noted(bench.store.examine().problems, f"run {run_id}, PASS of {serial}", what)
     run_id = bench.claim("W2605015").run_id
     write = bench.store.intent(run_id, "bms", "serial-number", "W2605015")
     bench.store.verified(write, "W2605015")
     bench.work(run_id)
     bench.store.finish(run_id, bench.ending(trace=bench.traced("W2605015")))
-    assert told(
+    assert noted(
         bench.store.examine().problems, f"run {run_id}", "W2605015 is not written in the trace"
     )
     broken = folder / "broken.log.gz"
     broken.write_bytes(b"no trace")
     run_id = passed(bench, "W2605016", broken)
-    assert told(bench.store.examine().problems, f"run {run_id}", "its trace cannot be read")
+    assert noted(bench.store.examine().problems, f"run {run_id}", "its trace cannot be read")
 
 
 IMAGES_BMS = IMAGES[next(target for target in IMAGES if target.name == "bms")]
@@ -288,7 +288,7 @@ def test_wholly_new_records_are_found_where_the_heads_have_to_be(
         assert not found.is_checked_elsewhere
     key_locations = KeyLocations(tmp_path / "none", (str(plant.keys),))
     with Store.open(new, station="x", read_only=True, key_locations=key_locations) as store:
-        assert told(store.examine().problems, "heads of line-2", "no head of these records")
+        assert noted(store.examine().problems, "heads of line-2", "no head of these records")
 
 
 def test_kept_heads_that_were_changed_are_reported(plant: Bench, tmp_path: Path) -> None:

@@ -48,14 +48,14 @@ OWN = version_answer(SERIAL, "V1")
 OTHER = version_answer("MK-2", "V1")
 
 
-def frames(*said: tuple[float, Message]) -> Iterator[tuple[float, Frame]]:
-    for at_s, message in said:
+def frames(*reported: tuple[float, Message]) -> Iterator[tuple[float, Frame]]:
+    for at_s, message in reported:
         for number, frame in enumerate(split(message.can_id, encode(message))):
             yield 1000.0 + at_s + 0.0005 * number, frame
 
 
 @pytest.mark.parametrize(
-    ("said", "uncaused"),
+    ("reported", "uncaused"),
     [
         ([(0, BLANK), (1, BOOT)], [1.001]),
         ([(0, BLANK), (1, BOOT), (1.05, BOOT), (2, BLANK), (3, BOOT)], [1.001, 3.001]),
@@ -72,14 +72,14 @@ def frames(*said: tuple[float, Message]) -> Iterator[tuple[float, Frame]]:
     ],
 )
 def test_an_announcement_without_a_cause(
-    said: list[tuple[float, Message]], uncaused: list[float]
+    reported: list[tuple[float, Message]], uncaused: list[float]
 ) -> None:
-    heard = traces_of_targets(["bms"], frames(*said))["bms"]
+    heard = traces_of_targets(["bms"], frames(*reported))["bms"]
     assert heard.restarts.uncaused == pytest.approx(uncaused, abs=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("said", "uncaused"),
+    ("reported", "uncaused"),
     [
         ([(0, DATA), (1, BOOT), (1.05, BOOT), (2, OWN)], [1.001]),
         ([(0, DATA), (1, QUESTION), (1.5, QUESTION), (2, BOOT), (3, OWN)], [2.001]),
@@ -96,22 +96,22 @@ def test_an_announcement_without_a_cause(
     ],
 )  # fmt: skip
 def test_an_announcement_before_the_unit_is_identified(
-    said: list[tuple[float, Message]], uncaused: list[float]
+    reported: list[tuple[float, Message]], uncaused: list[float]
 ) -> None:
-    heard = traces_of_targets(["bms"], frames(*said))["bms"]
+    heard = traces_of_targets(["bms"], frames(*reported))["bms"]
     assert heard.restarts.uncaused == pytest.approx(uncaused, abs=1e-3)
 
 
 def test_a_burst_after_the_end_of_a_transfer_has_its_cause_and_another_one_has_none() -> None:
     sent = [(0.01 * n, each) for n, each in enumerate(transfer(BMS, IMAGES[BMS]))]
-    said = [*sent, (2.0, BOOT), (2.05, BOOT)]
-    assert not traces_of_targets(["bms"], frames(*said))["bms"].restarts.uncaused
-    said += [(2.5, BLANK), (3.0, BOOT)]
-    assert len(traces_of_targets(["bms"], frames(*said))["bms"].restarts.uncaused) == 1
+    reported = [*sent, (2.0, BOOT), (2.05, BOOT)]
+    assert not traces_of_targets(["bms"], frames(*reported))["bms"].restarts.uncaused
+    reported += [(2.5, BLANK), (3.0, BOOT)]
+    assert len(traces_of_targets(["bms"], frames(*reported))["bms"].restarts.uncaused) == 1
 
 
 @pytest.mark.parametrize(
-    ("said", "changes"),
+    ("reported", "changes"),
     [
         ([BLANK, BLANK], []),
         ([BLANK, NUMBER, BLANK, NUMBER, OWN, OWN], []),
@@ -121,8 +121,8 @@ def test_a_burst_after_the_end_of_a_transfer_has_its_cause_and_another_one_has_n
         ([BLANK, NUMBER, OWN, BLANK], ["serial number"]),
     ],
 )
-def test_an_identity_that_changes(said: list[Message], changes: list[str]) -> None:
-    heard = traces_of_targets(["bms"], frames(*((n * 0.1, m) for n, m in enumerate(said))))
+def test_an_identity_that_changes(reported: list[Message], changes: list[str]) -> None:
+    heard = traces_of_targets(["bms"], frames(*((n * 0.1, m) for n, m in enumerate(reported))))
     assert heard["bms"].changes == changes
 
 

@@ -69,7 +69,7 @@ def verified(bench: Bench, key_locations: KeyLocations | None = None) -> Examina
         return store.examine()
 
 
-def told(problems: tuple[Problem, ...], where: str, what: str) -> bool:
+def noted(problems: tuple[Problem, ...], where: str, what: str) -> bool:
     return any(where in each.where and what in each.what for each in problems)
 
 
@@ -148,7 +148,7 @@ def test_what_was_forged_with_the_heads_beside_the_key_is_reported_by_another_pl
     }  # fmt: skip
     forge(line)
     found = verified(line)
-    assert told(found.problems, "audit trail of line-2", FORGERIES[forge])
+    assert noted(found.problems, "audit trail of line-2", FORGERIES[forge])
     assert all(str(tmp_path / "share") in each.what for each in found.problems)
     alone = verified(line, KeyLocations(line.keys))
     assert not alone.problems  # nothing tells it there, and it does not claim to
@@ -191,7 +191,7 @@ def test_heads_on_a_server_report_a_forgery_and_only_grow(postgres: Server, tmp_
     kept = place.of("line-2", bench.store.signer.records_id)
     assert kept.of_row(3) == HeadsFile(beside(bench)).of_row(3)
     cut_tail(bench)
-    assert told(verified(bench).problems, "audit trail of line-2", "row 8")
+    assert noted(verified(bench).problems, "audit trail of line-2", "row 8")
     engine = create_engine(url)
     for statement in (
         "DELETE FROM kept_head",

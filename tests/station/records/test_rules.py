@@ -73,8 +73,8 @@ def test_two_runs_of_one_unit_or_socket_cannot_run_at_once(running: Bench) -> No
     same_socket = INSERT_RUN.format(unit="99", socket="socket_id", state="RUNNING", required=1)
     for statement, what in ((same_unit, "unit"), (same_socket, "socket")):
         with running.outsider() as other:
-            said = refused(other, *others, statement)
-        assert f"run.{what}_id" in said or f"one_running_run_per_{what}" in said
+            reported = refused(other, *others, statement)
+        assert f"run.{what}_id" in reported or f"one_running_run_per_{what}" in reported
 
 
 @pytest.mark.parametrize(
@@ -117,8 +117,8 @@ def test_a_running_run_cannot_be_made_what_it_is_not(
     running: Bench, statement: str, why: str
 ) -> None:
     with running.outsider() as other:
-        said = refused(other, statement)
-    assert any(each in said for each in why.split("|")), said
+        reported = refused(other, statement)
+    assert any(each in reported for each in why.split("|")), reported
 
 
 @pytest.mark.parametrize(

@@ -112,9 +112,9 @@ def test_old_records_are_taken_over_whole(old: Old) -> None:
 
 def test_a_station_upgrades_its_file_at_its_start_and_keeps_a_copy(old: Old) -> None:
     before = old.rows()
-    said: list[str] = []
-    with old.open(report=said.append) as store:
-        assert "minutes" in said[0]
+    reported: list[str] = []
+    with old.open(report=reported.append) as store:
+        assert "minutes" in reported[0]
         assert not store.examine().problems
         assert store.recover() != ()
     (copy,) = old.folder.glob("*.schema-2")
@@ -157,8 +157,8 @@ def test_a_rule_that_was_taken_away_before_is_reported_and_stays_reported(old: O
     assert "schema, trigger run_update: it was removed" in done.problems
     assert "schema, index foreign_one: it was added" in done.problems
     with old.open(read_only=True) as store:
-        told = [each.what for each in store.examine().problems]
-    assert told == [f"found at the upgrade: {problem}" for problem in done.problems]
+        noted = [each.what for each in store.examine().problems]
+    assert noted == [f"found at the upgrade: {problem}" for problem in done.problems]
 
 
 # -- what goes wrong ------------------------------------------------------------------------------
