@@ -291,7 +291,7 @@ class OperatorPage:
             return JSONResponse({"error": "no scan"}, 400)
         if not isinstance(text, str) or not text.strip() or len(text) > SCAN_MAX:
             return JSONResponse({"error": "no scan"}, 400)
-        if _now() - shown_at > SHOWN_LIMIT_S:  # it waited: other units may be in the sockets
+        if not 0 <= _now() - shown_at <= SHOWN_LIMIT_S:  # it waited: units may have been exchanged
             return JSONResponse({"error": "late"}, 409)
         # The station answers it by an event, which every page shows.
         await asyncio.to_thread(self._submit, text, _source_of(request))

@@ -14,7 +14,7 @@ import flasher.cli.look.help as printed
 import flasher.station.records.errors
 from flasher import errors
 from flasher.errors import ErrorCode, ExitCode, FlasherError
-from flasher.host import outcome
+from flasher.host import outcome, verify
 from flasher.station.codes import CODES
 from flasher.station.records.errors import Refusal
 from tests.cli.conftest import Flasher
@@ -68,7 +68,10 @@ def test_the_code_of_an_error_has_the_exit_code_of_its_class() -> None:
                         assert exit_code_in(code) == kind.exit_code, (path, node.lineno)
                         used.add(code)
     used |= {kind.default_code for kind in KINDS.values()}
-    used |= {each.code for each in outcome._EXPLANATIONS.values() if each.code is not None}
+    for described in (*outcome._EXPLANATIONS.values(), *verify._EXPLANATIONS.values()):
+        if described.code is not None:
+            assert exit_code_in(described.code) == described.kind.exit_code, described
+            used.add(described.code)
     assert used | {ErrorCode.FILE_FAULTS} == set(ErrorCode)
 
 

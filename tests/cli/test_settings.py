@@ -114,8 +114,18 @@ def test_another_unit_after_the_upgrade_gets_no_settings(
 ) -> None:
     battery.lose(serial_number=SerialNumber(_text("W2605999")), user_string_1=EMPTY)
     run = flash("--keep-settings")
+    assert run.code == ExitCode.WRONG_DEVICE
+    assert "E608" in run.err
+    assert battery.kept["user string 1"] == EMPTY
+
+
+def test_a_unit_that_lost_its_serial_number_gets_no_settings(
+    battery: Settings, flash: Callable[..., Run]
+) -> None:
+    battery.lose(serial_number=SerialNumber(_text("")), user_string_1=EMPTY)
+    run = flash("--keep-settings")
     assert run.code == ExitCode.OK
-    assert "not all were compared: The BMS has the serial number 'W2605999'" in run.err
+    assert "not all were compared: The BMS has the serial number none" in run.err
     assert battery.kept["user string 1"] == EMPTY
 
 

@@ -214,13 +214,16 @@ def test_a_scan_that_did_not_reach_the_station_is_reported_and_forgotten(
     assert line.scans == ["BAT2620-0002"]
 
 
+@pytest.mark.parametrize("later_s", [60.0, -60.0])
 def test_a_scan_that_was_held_up_on_its_way_is_refused(
-    page: Page, tab: Tab, line: LineScreen, monkeypatch: pytest.MonkeyPatch
+    page: Page, tab: Tab, line: LineScreen, monkeypatch: pytest.MonkeyPatch, later_s: float
 ) -> None:
-    """A cable was unplugged for a minute: other units may be in the sockets when it arrives."""
+    """A cable was unplugged for a minute, or the station's computer started anew: other units may
+    be in the sockets when it arrives.
+    """
 
     def hold(route: Route) -> None:
-        monkeypatch.setattr(operator, "_now", lambda: time.perf_counter() + 60.0)
+        monkeypatch.setattr(operator, "_now", lambda: time.perf_counter() + later_s)
         route.continue_()
 
     page.route("**/line/scan", hold)
