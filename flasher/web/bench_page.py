@@ -34,6 +34,7 @@ from flasher.web.bench_bike import upgrade_bike
 from flasher.web.bench_compare import compare
 from flasher.web.bench_state import BenchState, Done
 from flasher.web.bench_watch import watch
+from flasher.web.feed import is_late, page_time
 from flasher.web.pages import Pages, streamed
 from flasher.web.series import SHOWN_S, take_next_bikes
 
@@ -208,7 +209,7 @@ class BenchPage:
     async def _messages(self, translate: Translator) -> AsyncIterator[dict[str, Any]]:
         sent: dict[str, str] = {}
         async for batch in self._bench.feed.follow():
-            message: dict[str, Any] = {}
+            message: dict[str, Any] = {"at": page_time()}
             for _, state in batch.changes[-1:]:
                 parts = self._parts(translate, state)
                 message["parts"] = {
@@ -235,6 +236,8 @@ class BenchPage:
             if word == "stop":
                 self._bench.stop()
                 return JSONResponse({})
+            if is_late(float(order["shown_at"])):
+                return JSONResponse({"error": "late"}, 412)
             if word == "agree":
                 self._bench.agree(int(order["question"]))
                 return JSONResponse({})

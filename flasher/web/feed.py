@@ -10,11 +10,14 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final
+
+from flasher.bus.link import suspended_s
 
 BEAT_S: Final = 0.5
 """Maximum interval between two messages to a page."""
@@ -22,6 +25,20 @@ GATHER_S: Final = 0.04
 """Changes within this time are sent as one message."""
 PENDING_MAX: Final = 2000
 """Number of unsent changes from which a page receives all states instead."""
+SHOWN_LIMIT_S: Final = 3.0
+"""Maximum age of a page's last message when an order of it arrives; older pages are covered."""
+
+
+def page_time() -> float:
+    """Time of messages to pages, in seconds, which goes on while this computer is suspended."""
+    return time.perf_counter() + suspended_s()
+
+
+def is_late(shown_at: float) -> bool:
+    """True if an order was held up on its way since `shown_at`, the `page_time` of the last message
+    that its page had, or this computer was restarted: units may have been exchanged meanwhile.
+    """
+    return not 0 <= page_time() - shown_at <= SHOWN_LIMIT_S
 
 
 @dataclass

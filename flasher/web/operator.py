@@ -18,7 +18,6 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.routing import BaseRoute, Route
 
-from flasher.bus.link import suspended_s
 from flasher.files import parse_json
 from flasher.i18n import text
 from flasher.protocol.text import printable
@@ -37,7 +36,7 @@ from flasher.station.records.model import RunState
 from flasher.station.shift_counts import ShiftCounts, ShiftFigures
 from flasher.station.socket import PAGE, Source
 from flasher.translation import Translator
-from flasher.web.feed import Feed
+from flasher.web.feed import Feed, is_late, page_time
 from flasher.web.pages import Pages, streamed
 
 TAIL_DIGITS: Final = 6
@@ -47,8 +46,6 @@ _PAGE_DIGITS: Final = 8
 SCAN_MAX: Final = 300
 """Maximum length of a scan from a page."""
 HEAD_EVERY_S: Final = 0.1
-SHOWN_LIMIT_S: Final = 3.0
-"""Maximum age of a page's last message when a scan of it arrives; older pages are covered."""
 SILENCE_LIMIT_S: Final = 1.5
 """Time without a turn of the station's loop after which the page shows the station as silent."""
 _HEAD: Final = "head"
@@ -291,16 +288,11 @@ class OperatorPage:
             return JSONResponse({"error": "no scan"}, 400)
         if not isinstance(text, str) or not text.strip() or len(text) > SCAN_MAX:
             return JSONResponse({"error": "no scan"}, 400)
-        if not 0 <= _now() - shown_at <= SHOWN_LIMIT_S:  # it waited: units may have been exchanged
+        if is_late(shown_at):
             return JSONResponse({"error": "late"}, 409)
         # The station answers it by an event, which every page shows.
         await asyncio.to_thread(self._submit, text, _source_of(request))
         return JSONResponse({})
-
-
-def _now() -> float:
-    """Time of messages to pages, which goes on while this computer is suspended."""
-    return time.perf_counter() + suspended_s()
 
 
 def _source_of(request: Request) -> Source:
@@ -313,7 +305,7 @@ async def _messages(
     feed: Feed, translate: Translator, source: Source
 ) -> AsyncIterator[dict[str, Any]]:
     async for batch in feed.follow():
-        message: dict[str, Any] = {"at": _now()}
+        message: dict[str, Any] = {"at": page_time()}
         if batch.is_all:
             message["all"] = True
         tiles = [_tile(state, translate) for _, state in batch.changes if isinstance(state, Row)]

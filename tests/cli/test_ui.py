@@ -44,7 +44,9 @@ class _Browser:
         with self._opener.open(f"{self._root}/bench/events") as stream:
             for line in stream:
                 if line.startswith(b"data:"):
-                    self._parts |= json.loads(line[5:]).get("parts", {})
+                    message = json.loads(line[5:])
+                    self._shown_at = message["at"]
+                    self._parts |= message.get("parts", {})
                     yield
 
     def until(self, part: str, text: str) -> None:
@@ -53,7 +55,7 @@ class _Browser:
             next(self._states)
 
     def order(self, word: str, **fields: str) -> None:
-        body = json.dumps({"order": word, **fields}).encode()
+        body = json.dumps({"order": word, "shown_at": self._shown_at, **fields}).encode()
         headers = {"origin": self._root, "x-flasher-token": self._token}
         order = Request(f"{self._root}/bench/order", body, headers)  # noqa: S310  our own
         self._opener.open(order).read()

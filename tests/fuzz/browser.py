@@ -1,7 +1,8 @@
 """Requests as a browser, or a program, may send them to the pages; each an input of a harness.
 
 An input is the text of a request: method and target, headers, a blank line, the body. What it does
-not state is added, so that it passes the guard: host, origin, the cookie of the session, its token.
+not state is added, so that it is taken: host, origin, the cookie of the session, its token, the
+time of the page whose order it is.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from urllib.parse import unquote
 import itsdangerous
 from starlette.types import ASGIApp, Message
 
+from flasher.web.feed import page_time
 from flasher.web.guard import TOKEN_HEADER
 
 HOST: Final = "127.0.0.1:8740"
@@ -88,6 +90,8 @@ def send(app: ASGIApp, data: bytes, session_cookie: bytes) -> Answered:
 def _request(data: bytes, session_cookie: bytes) -> tuple[dict[str, Any], bytes]:
     """Scope of a request, as uvicorn makes it, and its body."""
     head, _, body = data.partition(b"\n\n")
+    if body.startswith(b"{") and body.endswith(b"}") and b'"shown_at"' not in body:
+        body = b'{"shown_at": %f%s' % (page_time(), body[1:] if body == b"{}" else b", " + body[1:])
     first, *lines = head.split(b"\n")
     method, _, target = first.partition(b" ")
     method = method.strip()[:_METHOD_MAX].upper() or b"GET"

@@ -5,17 +5,20 @@ from __future__ import annotations
 import io
 import re
 import threading
+import time
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Route, expect
 
 from flasher import events
 from flasher.history import Began, Flash, Reached
+from flasher.web import feed
 from flasher.web.bench import BenchController
+from flasher.web.bench_state import Activity
 from flasher.web.virtual_bike import BikeFault
 from tests.end_to_end.stage import NEW, OLD, image_of
 from tests.firmware import VECTORS
@@ -219,6 +222,27 @@ def test_a_check_is_waived_in_a_second_step_that_names_the_risk(page: Page) -> N
     page.check("#waive-2-risk")
     page.click("#waive-2-go")
     expect(page.locator("#start")).to_contain_text("Waived for this upgrade")
+
+
+def test_an_order_that_was_held_up_on_its_way_is_refused_and_a_stop_is_not(
+    page: Page, place: BenchPlace, tab: Tab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A minute later another unit may be connected."""
+    _choose(page)
+
+    def hold(route: Route) -> None:
+        monkeypatch.setattr(feed, "page_time", lambda: time.perf_counter() + 60.0)
+        route.continue_()
+
+    page.route("**/bench/order", hold)
+    page.click("#go:enabled")
+    expect(page.locator("#message")).to_contain_text("did not receive that")
+    assert place.bench.state.done is None
+    assert place.bench.state.doing is Activity.NOTHING
+    assert ["412" in each for each in tab.wrong] == [True]
+    tab.wrong.clear()
+    answer = page.evaluate('post("/bench/order", {order: "stop"})')
+    assert answer == {}
 
 
 def test_the_page_states_when_its_program_has_ended(page: Page, place: BenchPlace) -> None:

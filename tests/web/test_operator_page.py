@@ -28,7 +28,7 @@ from flasher.station.events import (
     SocketState,
 )
 from flasher.station.records.model import RunState
-from flasher.web import operator
+from flasher.web import feed
 from tests.web.barriers import barriers
 from tests.web.conftest import Tab
 from tests.web.line_screen import AT, LineScreen, ended, served, tile
@@ -223,7 +223,7 @@ def test_a_scan_that_was_held_up_on_its_way_is_refused(
     """
 
     def hold(route: Route) -> None:
-        monkeypatch.setattr(operator, "_now", lambda: time.perf_counter() + later_s)
+        monkeypatch.setattr(feed, "page_time", lambda: time.perf_counter() + later_s)
         route.continue_()
 
     page.route("**/line/scan", hold)

@@ -38,11 +38,11 @@ function apply(message) {
   }
 }
 
-async function send(path, body) {
+async function send(path, body, limitMs) {
   const notice = byId("message");
   notice.textContent = "";
   try {
-    return await post(path, body);
+    return await post(path, body, limitMs);
   } catch (error) {
     notice.textContent = document.body.dataset[`message${error.message}`] ?? document.body.dataset.message;
   }
@@ -61,7 +61,8 @@ async function upload(files) {
 addEventListener("submit", (event) => {
   event.preventDefault();
   used = document.activeElement.id;
-  send("/bench/order", Object.fromEntries(new FormData(event.target, event.submitter)));
+  const order = Object.fromEntries(new FormData(event.target, event.submitter));
+  send("/bench/order", { ...order, shown_at: shownAt }, 5000);
 });
 addEventListener("change", (event) => event.target.type === "file" && upload(event.target.files));
 addEventListener("dragover", (event) => event.preventDefault());

@@ -167,7 +167,6 @@ function apply(message) {
 
 const waiting = [];
 let isSending = false;
-let shownAt = 0; // the station's time of the last message: it refuses scans that waited
 
 const scanned = (text) => {
   waiting.push({ text, shown_at: shownAt });
@@ -231,7 +230,4 @@ byId("sounds").addEventListener("click", async () => {
 });
 
 setInterval(() => put(byId("clock"), new Date().toLocaleTimeString(document.documentElement.lang)), 500);
-follow(`/line/events${location.search}`, (message) => {
-  shownAt = message.at;
-  apply(message);
-});
+follow(`/line/events${location.search}`, apply);

@@ -5,6 +5,7 @@
 
 const token = document.querySelector("meta[name=flasher-token]").content;
 const byId = (id) => document.getElementById(id);
+let shownAt = 0; // the program's time of the last message: it refuses orders that waited
 
 function follow(path, apply) {
   let source;
@@ -20,6 +21,7 @@ function follow(path, apply) {
     source = new EventSource(path);
     source.onmessage = (event) => {
       const message = JSON.parse(event.data);
+      shownAt = message.at;
       apply(message);
       isHeard();
       if (message.ended) {
