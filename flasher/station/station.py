@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import hashlib
 import multiprocessing
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor, Future
@@ -183,8 +182,8 @@ class Station:
         """Claimed runs that are not saved yet, by socket."""
         self._scans: deque[tuple[str, Source, float]] = deque()
         """Scans with the times at which they were submitted."""
-        self.timer: Callable[[], float] = time.perf_counter
-        """Clock for the age of scans."""
+        self.timer = self.clock.monotonic_s
+        """Clock for the age of scans and the pauses between turns."""
         self._turned_at = self.timer()
         """Time at which the last turn ended."""
         self._stalled = (0.0, 0.0)
