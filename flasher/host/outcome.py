@@ -393,7 +393,7 @@ _NO_SESSION_EITHER: Final = _EXPLANATIONS[Ending.NO_BOOT_VERSION]._replace(
     remedy="Check supply, wiring, termination and bit rate (flasher doctor), then reach the device "
     "by flasher rescue and a power cycle."
 )
-"""ErrorDescription for a device that was silent to the update command as well (R26)."""
+"""Explanation for a device that was silent to the update command as well (R26)."""
 _ANSWERED_OTHERWISE: Final = ErrorDescription(
     TransferError,
     "its bootloader numbers packets in another way than table 9 (two bytes, the low one first) or "

@@ -251,12 +251,10 @@ def check_level(plan: Plan, level: Level, options: UpgradeOptions | None = None)
         )
 
 
-def version_check(
-    plan: Plan, options: UpgradeOptions, serial_before: str = ""
-) -> Runner[Verification]:
+def version_check(plan: Plan, options: UpgradeOptions) -> Runner[Verification]:
     """Create an engine that waits for the new application and queries its version."""
     return Runner(
-        lambda run: check_version(run, plan, options, serial_before),
+        lambda run: check_version(run, plan, options),
         bitrate_bps=plan.bitrate_bps,
         timings=options.timings,
     )

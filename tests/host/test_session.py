@@ -23,6 +23,7 @@ from flasher.host.verify import (
     Verdict,
     Verification,
     as_level,
+    check_version,
     memory_check,
     possible_levels,
     version_check,
@@ -473,7 +474,12 @@ def test_a_bootloader_that_announces_itself_beside_the_new_application_is_a_seco
 def test_an_application_with_another_serial_number_than_before_is_another_unit(
     before: str, now: str, verdict: Verdict
 ) -> None:
-    check = version_check(planned(), UpgradeOptions(), before)
+    options = UpgradeOptions()
+    check = Runner[Verification](
+        lambda run: check_version(run, planned(), options, before),
+        bitrate_bps=planned().bitrate_bps,
+        timings=options.timings,
+    )
     application = Application(check)
     while application.next_question() is not None:
         application.answer(VERSION, version(now))
