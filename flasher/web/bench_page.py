@@ -236,7 +236,7 @@ class BenchPage:
             if word == "stop":
                 self._bench.stop()
                 return JSONResponse({})
-            if is_late(float(order["shown_at"])):
+            if is_late(order["shown_at"]):
                 return JSONResponse({"error": "late"}, 412)
             if word == "agree":
                 self._bench.agree(int(order["question"]))

@@ -34,11 +34,15 @@ def page_time() -> float:
     return time.perf_counter() + suspended_s()
 
 
-def is_late(shown_at: float) -> bool:
+def is_late(shown_at: Any) -> bool:
     """True if an order was held up on its way since `shown_at`, the `page_time` of the last message
-    that its page had, or this computer was restarted: units may have been exchanged meanwhile.
+    that its page had, or this computer was restarted: units may have been exchanged meanwhile. So
+    is an order with anything else in its place.
     """
-    return not 0 <= page_time() - shown_at <= SHOWN_LIMIT_S
+    try:
+        return not 0 <= page_time() - float(shown_at) <= SHOWN_LIMIT_S
+    except (TypeError, ValueError, OverflowError):
+        return True
 
 
 @dataclass

@@ -283,7 +283,7 @@ class OperatorPage:
     async def _scan(self, request: Request) -> Response:
         try:
             scan = parse_json(await request.body())
-            text, shown_at = scan["text"], float(scan["shown_at"])
+            text, shown_at = scan["text"], scan["shown_at"]
         except (ValueError, TypeError, KeyError):
             return JSONResponse({"error": "no scan"}, 400)
         if not isinstance(text, str) or not text.strip() or len(text) > SCAN_MAX:

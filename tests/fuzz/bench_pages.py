@@ -132,6 +132,7 @@ def _requests() -> Iterator[bytes]:
     # These broke it.
     yield b"POST /bench/order\n\n" + b"[" * 2000
     yield b'POST /bench/order\n\n{"order": "adapter", "name": []}'
+    yield b'POST /bench/order\n\n{"order": "adapter", "shown_at": 1' + b"0" * 400 + b"}"
     yield b'POST /bench/order\n\n{"order": "image", "name": 3}'
     yield b'POST /bench/order\n\n{"order": "folder", "path": "~no_such_user"}'
     yield b'POST /bench/order\n\n{"order": "folder", "path": "' + b"a" * 1000 + b'"}'

@@ -120,6 +120,7 @@ def _requests() -> Iterator[bytes]:
         yield f"!GET {path}".encode()
     yield f'POST {LINE}/scan\n\n{{"text": "W2605004"}}'.encode()
     yield f'POST {LINE}/scan\n\n{{"text": "SOCKET A"}}'.encode()
+    yield f'POST {LINE}/scan\n\n{{"text": "SOCKET A", "shown_at": 1{"0" * 400}}}'.encode()
     for fields in (f"badge=BADGE-2&pin={PIN}", "badge=BADGE-3", "password=x", "badge=&pin="):
         yield f"!POST {LOGIN}\n\ntoken={browser.TOKEN}&{fields}".encode()
     yield f"POST {SIGN_OUT}\n\ntoken={browser.TOKEN}&everywhere=1".encode()

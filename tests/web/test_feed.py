@@ -19,7 +19,7 @@ from flasher.station.events import Progressed, RunEnded, StationEvent, StationSt
 from flasher.station.health import HealthWatch
 from flasher.station.shift_counts import ShiftCounts
 from flasher.web import feed as module
-from flasher.web.feed import Batch, Feed, _Follower
+from flasher.web.feed import Batch, Feed, _Follower, is_late
 from flasher.web.operator import Screen
 from tests.web.own_loop import in_own_loop
 
@@ -190,3 +190,17 @@ def test_a_page_that_was_open_shows_what_one_shows_that_is_opened_later(
         assert shown == dict(screen.feed._take(late_page).changes)
         for name, row in board.rows.items():
             assert replace(shown[f"socket {name}"], state=row.state) == row
+
+
+@pytest.mark.parametrize(
+    ("shown_at", "late"),
+    [
+        (100.0, False), (97.0, False), (96.9, True), (100.1, True), (100, False), ("x", True),
+        (None, True), ([], True), (10**400, True), (float("nan"), True), (float("inf"), True),
+    ],
+)  # fmt: skip
+def test_an_order_is_late_unless_its_page_was_shown_a_moment_ago(
+    monkeypatch: pytest.MonkeyPatch, shown_at: object, late: bool
+) -> None:
+    monkeypatch.setattr(module, "page_time", lambda: 100.0)
+    assert is_late(shown_at) is late
