@@ -8,6 +8,7 @@ import errno
 import importlib.util
 import re
 import socket
+import threading
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
@@ -30,6 +31,8 @@ from flasher.python_can import can
 
 _ANSWER_LIMIT_S: Final = 5.0
 """Maximum time for each answer of a socketcand server while it is opened."""
+_LIMITING: Final = threading.Lock()
+"""The limit is of the whole process: who sets it restores it before another thread does."""
 _CHANNELS: Final = {
     "pcan": "PCAN_USBBUS1",
     "slcan": "COM3",
@@ -178,12 +181,13 @@ def _answers_limited() -> Iterator[None]:
     """Give the sockets that are made here a time limit: python-can awaits the greeting of a
     socketcand server without one.
     """
-    before = socket.getdefaulttimeout()
-    socket.setdefaulttimeout(_ANSWER_LIMIT_S)
-    try:
-        yield
-    finally:
-        socket.setdefaulttimeout(before)
+    with _LIMITING:
+        before = socket.getdefaulttimeout()
+        socket.setdefaulttimeout(_ANSWER_LIMIT_S)
+        try:
+            yield
+        finally:
+            socket.setdefaulttimeout(before)
 
 
 def _unusable(channel: str, bitrate_bps: object, *, sends: bool) -> BusError | None:

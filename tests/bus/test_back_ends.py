@@ -26,7 +26,7 @@ from can import CanOperationError as Op
 from can.interfaces.pcan.pcan import PcanCanOperationError
 from can.interfaces.vector.exceptions import VectorOperationError
 
-from flasher.bus import adapter
+from flasher.bus import adapter, opening
 from flasher.bus.adapter import CanLink, open_adapter
 from flasher.bus.health import ControllerState, TroubleKind
 from flasher.bus.link import AT_ONCE, SEND_LIMIT_S
@@ -765,6 +765,23 @@ def test_a_socketcand_that_does_not_greet_ends_in_bounded_time(
         caught.value.__cause__ = None
         del caught
         gc.collect()
+
+
+def test_two_threads_that_open_a_socketcand_leave_sockets_without_a_limit() -> None:
+    second_is_in, first_is_out = threading.Event(), threading.Event()
+
+    def open_second() -> None:
+        with opening._answers_limited():
+            second_is_in.set()
+            first_is_out.wait(10.0)
+
+    second = threading.Thread(target=open_second)
+    with opening._answers_limited():
+        second.start()
+        second_is_in.wait(0.05)  # it has to wait for the first one
+    first_is_out.set()
+    second.join()
+    assert socket.getdefaulttimeout() is None
 
 
 def test_a_controller_that_is_off_by_exception_is_reported_as_by_an_error_frame(
