@@ -101,7 +101,6 @@ def read_trace(
                 _check(at_s, frame)
                 bounds.frames += 1
                 yield at_s, frame
-            one.check_found()
         except NotImplementedError as error:
             raise UsageError(
                 f"{shown}: this trace format needs a package that is not installed.",
@@ -122,6 +121,7 @@ def read_trace(
                 cause=printable(f"{reason}{error!s:.100}"),
                 remedy=remedy or "Record it again, or rename it to the suffix of its format.",
             ) from error
+    one.check_found(shown)
 
 
 class _OneBus:
@@ -152,12 +152,13 @@ class _OneBus:
             )
         return True
 
-    def check_found(self) -> None:
-        """Raise UnfitError if no frame is of the chosen channel."""
+    def check_found(self, shown: str) -> None:
+        """Raise UsageError if no frame of the file is of the chosen channel."""
         if self._chosen is not None and self._chosen not in self._names:
-            raise UnfitError(
-                f"it has no frame of the channel {self._chosen}",
-                remedy=f"Name one of these: {', '.join(self._names) or 'none'}.",
+            chosen = printable(self._chosen)
+            raise UsageError(
+                f"{shown} has no frame of the channel {chosen}.",
+                remedy=f"Name one of these: {printable(', '.join(self._names)) or 'none'}.",
             )
 
 
