@@ -26,6 +26,7 @@ from flasher.bus.back_ends import (
     meaning_of_send_error,
 )
 from flasher.bus.bit_rate import BitRate, bit_rate
+from flasher.bus.detect import DetectedAdapter, plugged_in
 from flasher.bus.echoes import FLAGGED_SENDER, Echoes, Sender
 from flasher.bus.fallback import Fallback
 from flasher.bus.health import (
@@ -48,6 +49,7 @@ from flasher.errors import BusError, ErrorCode, TransmitBlockedError
 from flasher.i18n import text
 from flasher.protocol.frame import EXTENDED_ID_MAX, STANDARD_ID_MAX, Frame
 from flasher.protocol.spec import FRAME_DATA_SIZE
+from flasher.protocol.text import printable
 from flasher.python_can import can
 
 _FULL_QUEUE_PAUSE_S: Final = 0.0005
@@ -108,6 +110,8 @@ def open_adapter(
     place, release = lock_name(merged), acquire(merged, holder)
 
     def open_again() -> can.BusABC:
+        if known is not None:
+            link.channel = merged["channel"] = settings["channel"] = _find_again(known)
         # The interface may have come back with other settings.
         bit_rate(default_bitrate_bps, config, merged, fallback)
         nonlocal place, release
@@ -139,7 +143,29 @@ def open_adapter(
         release()
         raise
     link.bit_rate = rate
+    listed = (each for each in plugged_in(interface) if each.channel == channel)
+    known = next((each for each in listed if any(each.identity)), None)
     return link
+
+
+def _find_again(known: DetectedAdapter) -> str:
+    """Return the channel of an adapter, whose name may have changed when it was plugged in again.
+    Raises BusError if another adapter has its name now.
+    """
+    found = plugged_in(known.interface)
+    same = [each for each in found if each.identity == known.identity]
+    if len(same) > 1:  # makers may give all adapters one serial number
+        same = [each for each in same if each.usb_path == known.usb_path]
+    if same or all(each.channel != known.channel for each in found):
+        return same[0].channel if same else known.channel
+    raise BusError(
+        f"{printable(known.channel)} is the name of another adapter now.",
+        where=known.interface,
+        cause=f"the adapter {printable(known.identity[0])} is not plugged in any more, or it has "
+        "no serial number and is in another port",
+        remedy="Plug it in where it was. Run the same command again.",
+        code=ErrorCode.ADAPTER_LOST,
+    )
 
 
 class CanLink:
@@ -157,8 +183,8 @@ class CanLink:
     ) -> None:
         self._release = release
         self._interface = interface
-        self._channel = channel
-        self._name = f"{interface} {channel}".strip()
+        self.channel = channel
+        """Channel of the adapter; may be empty."""
         self._open_again = open_again
         self.bit_rate: BitRate | None = None
         """Bit rate of the bus; None if unknown."""
@@ -218,14 +244,9 @@ class CanLink:
 
         port.read = counting
 
-    @property
-    def channel(self) -> str:
-        """Channel of the adapter; may be empty."""
-        return self._channel
-
     def __str__(self) -> str:
-        """Name of the adapter as given by the user."""
-        return self._name
+        """Name of the adapter."""
+        return f"{self._interface} {self.channel}".strip()
 
     def send(self, frame: Frame) -> None:
         """Pass a frame to the adapter; wait up to `SEND_LIMIT_S` for room in a full transmit queue.
@@ -326,12 +347,12 @@ class CanLink:
     @property
     def is_physical(self) -> bool:
         """True unless the bus is known to be virtual."""
-        return is_physical(self._interface, self._channel)
+        return is_physical(self._interface, self.channel)
 
     def health(self) -> LinkHealth:
         """Return the health of adapter and bus without sending. Takes up to 2 s on SocketCAN."""
         if self._interface == "socketcan":
-            state = read_interface(self._channel)
+            state = read_interface(self.channel)
             if isinstance(state, Interface):
                 return self._health.health(state.state, state.tx_errors, state.rx_errors)
         return self._health.health(_reported_state(self._bus, self._interface))

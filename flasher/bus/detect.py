@@ -45,6 +45,7 @@ SERIAL_PORTS: Final = frozenset({"slcan", "robotell", "seeedstudio", "serial"})
 _SERIAL_KEYS: Final = ("serial_number", "serial", "unique_hardware_id", "hw_serial", "hwid")
 """Keys under which back ends report an adapter's serial number."""
 _USB_PATH: Final = "usb_path"
+_INDEX: Final = "channel_index"
 _CHOOSING: Final[Mapping[str, tuple[str, ...]]] = {
     "ixxat": ("unique_hardware_id",),
     "neovi": ("serial",),
@@ -73,6 +74,14 @@ class DetectedAdapter:
     def usb_path(self) -> str:
         """USB path of the adapter, such as "1-1.4"; empty if not reported."""
         return str(self.details.get(_USB_PATH, ""))
+
+    @property
+    def identity(self) -> tuple[str, str]:
+        """Serial number, or USB path without one, and index of the channel in the adapter; what it
+        keeps when it is plugged in again under another name. Empty if not reported.
+        """
+        mark = self.serial_number or self.usb_path
+        return (mark, str(self.details.get(_INDEX, ""))) if mark else ("", "")
 
     @property
     def bus_kwargs(self) -> dict[str, Any]:
@@ -222,6 +231,13 @@ def _take(output: str, detected: DetectionResult, unanswered: set[str]) -> None:
 # -- without another process -----------------------------------------------------------------------
 
 
+def plugged_in(interface: str) -> list[DetectedAdapter]:
+    """List the adapters of the kernel, or the serial ports; none of other back ends."""
+    if interface == SOCKETCAN:
+        return list(network_adapters())
+    return list(serial_ports(interface)) if interface in SERIAL_PORTS else []
+
+
 def network_adapters(sysfs: Path = SYSFS) -> Iterator[DetectedAdapter]:
     """Yield the SocketCAN interfaces of Linux, up or down, with serial number and USB path."""
     for folder in sorted(sysfs.glob("*")):
@@ -234,9 +250,12 @@ def network_adapters(sysfs: Path = SYSFS) -> Iterator[DetectedAdapter]:
             ":" in device.name and (device.parent / "idVendor").exists()
         )
         usb_path = device.name.partition(":")[0] if is_usb else ""
-        yield DetectedAdapter(
-            SOCKETCAN, folder.name, _without_empty(serial_number=serial, usb_path=usb_path)
+        # Drivers number the channels of an adapter in one of the two, from 0.
+        index = max(int(_text(folder / name) or "0", 0) for name in ("dev_port", "dev_id"))
+        details = _without_empty(
+            serial_number=serial, usb_path=usb_path, channel_index=str(index or "")
         )
+        yield DetectedAdapter(SOCKETCAN, folder.name, details)
 
 
 def serial_ports(interface: str) -> Iterator[DetectedAdapter]:

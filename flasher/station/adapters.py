@@ -135,7 +135,8 @@ def worker_setups(
                 count=count,
             )
         name, power = each.config.name, each.config.power
-        setup = WorkerSetup(name, recipe.path, {}, each.bus, virtual, power)
+        adapter = None if each.bus is None else each.config
+        setup = WorkerSetup(name, recipe.path, {}, adapter, virtual, power)
         setups.append(with_recipe(setup, recipe))
     return setups
 

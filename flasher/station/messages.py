@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from flasher.errors import FlasherError
-from flasher.station.config import MockUnits
+from flasher.station.config import MockUnits, SocketConfig
 from flasher.station.events import OperatorPrompted, Progressed, StepEnded, StepStarted
 from flasher.station.records.model import Claim, Measurement, RunResult, WriteId
 
@@ -88,8 +88,8 @@ class WorkerSetup:
     recipe: Path
     files: Mapping[str, str]
     """SHA-256 of each file of the recipe: the process refuses other files."""
-    bus: Mapping[str, Any] | None
-    """Arguments of python-can's bus; None: virtual units."""
+    adapter: SocketConfig | None
+    """Adapter, which is looked for whenever it is opened; None: virtual units."""
     virtual: VirtualUnits | None = None
     power: str = ""
     is_from_plant: bool = False

@@ -31,6 +31,7 @@ from flasher.files import make_private
 from flasher.i18n import text
 from flasher.log import log_event
 from flasher.protocol.text import printable
+from flasher.station.adapters import detect, resolve
 from flasher.station.codes import Code
 from flasher.station.events import StepEnded
 from flasher.station.messages import (
@@ -386,7 +387,7 @@ def open_socket(
     setup: WorkerSetup, recipe: LoadedRecipe
 ) -> Iterator[tuple[Connection, VirtualSocket | None]]:
     """Open the connection of a socket. Raises UsageError, BusError."""
-    if setup.bus is None:
+    if setup.adapter is None:
         if setup.virtual is None:
             raise UsageError(f"Socket {setup.socket} has neither an adapter nor virtual units.")
         virtual = VirtualSocket(recipe, setup.virtual)
@@ -394,7 +395,8 @@ def open_socket(
         return
     holder = f"flasher station, socket {setup.socket}"
     dialect = recipe.targets[0].profile.dialect
-    with connect(dialect, holder=holder, **setup.bus) as connection:
+    (socket,) = resolve([setup.adapter], detect([setup.adapter]))
+    with connect(dialect, holder=holder, **(socket.bus or {})) as connection:
         yield connection, None
 
 

@@ -17,6 +17,7 @@ import pytest
 
 from flasher.bus import adapter
 from flasher.bus.adapter import CanLink, open_adapter
+from flasher.bus.detect import DetectedAdapter
 from flasher.bus.health import ControllerState
 from flasher.bus.inspect_interface import Interface, Unseen
 from flasher.bus.link import AT_ONCE, SEND_LIMIT_S
@@ -375,6 +376,65 @@ def test_a_lost_adapter_is_opened_again_with_the_same_configuration(
     assert len(opened[1].sent) == 1
     assert link.health().frames_sent == 1
     assert seen[0] == seen[3]
+    link.close()
+
+
+def named(names: dict[str, dict[str, str]]) -> list[DetectedAdapter]:
+    return [DetectedAdapter("socketcan", name, details) for name, details in names.items()]
+
+
+A, B = {"serial_number": "A", "usb_path": "1-1"}, {"serial_number": "B", "usb_path": "1-2"}
+NO_NUMBER = {"usb_path": "1-1"}
+SECOND = {**A, "channel_index": "1"}
+TWIN = {"serial_number": "A", "usb_path": "1-2"}
+
+
+@pytest.mark.usefixtures("no_configuration")
+@each(
+    "before, after, channel",
+    [
+        ({"can2": A, "can3": B}, {"can2": B, "can3": A}, "can3"),
+        ({"can2": A}, {"can2": A}, "can2"),
+        ({"can2": A}, {"can2": TWIN}, "can2"),
+        ({"can2": A}, {"can3": B}, "can2"),
+        ({"can2": A, "can3": SECOND}, {"can2": B, "can3": A, "can4": SECOND}, "can3"),
+        ({"can2": SECOND, "can1": A}, {"can2": A, "can3": SECOND}, "can3"),
+        ({"can2": A, "can3": TWIN}, {"can2": TWIN, "can3": A}, "can3"),
+        ({"can2": A}, {"can2": B}, None),
+        ({"can2": A, "can3": TWIN}, {"can2": TWIN, "can4": {**A, "usb_path": "1-3"}}, None),
+        ({"can2": NO_NUMBER}, {"can2": NO_NUMBER}, "can2"),
+        ({"can2": NO_NUMBER}, {"can2": {"usb_path": "1-2"}}, None),
+        ({"can2": {}, "can1": {}}, {"can2": {}, "can1": {}}, "can2"),
+    ],
+)  # fmt: skip
+def test_a_lost_adapter_is_found_again_by_its_serial_number_and_never_by_its_name(
+    monkeypatch: pytest.MonkeyPatch,
+    before: dict[str, dict[str, str]],
+    after: dict[str, dict[str, str]],
+    channel: str | None,
+) -> None:
+    seen: list[dict[str, Any]] = []
+
+    def open_bus(**config: Any) -> FakeBus:
+        seen.append(config)
+        return FakeBus()
+
+    monkeypatch.setattr("can.Bus", open_bus)
+    monkeypatch.setattr(adapter, "plugged_in", lambda _interface: named(before))
+    link = open_adapter(250_000, interface="socketcan", channel="can2")
+    monkeypatch.setattr(adapter, "plugged_in", lambda _interface: named(after))
+    if channel is None:
+        with pytest.raises(BusError, match="can2 is the name of another adapter now") as caught:
+            link.reopen()
+        assert caught.value.code is ErrorCode.ADAPTER_LOST
+        assert len(seen) == 1
+    else:
+        link.reopen()
+        assert (seen[1]["channel"], link.channel, str(link)) == (
+            channel,
+            channel,
+            f"socketcan {channel}",
+        )
     link.close()
 
 

@@ -17,6 +17,7 @@ from typing import Any, NoReturn
 import pytest
 
 from flasher.api import Connection
+from flasher.bus.detect import DetectedAdapter
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
 from flasher.errors import BusError, UsageError
@@ -24,7 +25,7 @@ from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import WELLING
-from flasher.station.config import MockUnits
+from flasher.station.config import MockUnits, SocketConfig
 from flasher.station.events import StepStarted
 from flasher.station.messages import (
     AdapterDown,
@@ -47,7 +48,14 @@ from flasher.station.records.model import Claim, RunId, RunKind, RunResult, RunS
 from flasher.station.unit_run import UnitRun
 from flasher.station.unit_steps import UnitSteps
 from flasher.station.virtual_units import Health, VirtualSocket, make_device
-from flasher.station.worker import StationPipe, Worker, load_same, load_when_whole, work_on
+from flasher.station.worker import (
+    StationPipe,
+    Worker,
+    load_same,
+    load_when_whole,
+    open_socket,
+    work_on,
+)
 from tests.loops import each
 from tests.station.factory import DAY, USUAL, make_recipe
 from tests.station.unit_bench import WRITES
@@ -279,6 +287,36 @@ def test_an_adapter_that_cannot_be_opened_is_reported_once_and_tried_again(tmp_p
     assert [after - before for before, after in pairwise(tries)] == pytest.approx(
         [1.0] * 3, abs=0.1
     )
+
+
+def test_an_adapter_that_has_another_name_now_is_still_the_sockets(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its process was started again, or did not find it at first."""
+    socket = RealAdapter(tmp_path)
+    setup = replace(
+        socket.setup, adapter=SocketConfig(name="A", interface="socketcan", serial_number="7")
+    )
+    found: list[DetectedAdapter] = []
+    opened: list[dict[str, Any]] = []
+
+    @contextmanager
+    def connect(_dialect: object, **bus: Any) -> Iterator[Connection]:
+        opened.append(bus)
+        yield socket.connection()
+
+    monkeypatch.setattr("flasher.station.worker.connect", connect)
+    monkeypatch.setattr("flasher.station.adapters.network_adapters", lambda _network: found)
+    with (
+        pytest.raises(BusError, match="no socketcan adapter with the serial number 7"),
+        open_socket(setup, socket.recipe),
+    ):
+        pass
+    for name in ("can2", "can3"):
+        found[:] = [DetectedAdapter("socketcan", name, {"serial_number": "7"})]
+        with open_socket(setup, socket.recipe):
+            pass
+    assert [bus["channel"] for bus in opened] == ["can2", "can3"]
 
 
 def test_a_socket_that_cannot_be_used_is_reported_and_not_tried_again(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from sqlalchemy import event
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import BMS, OBC, WELLING, WMC, Command
+from flasher.station.config import SocketConfig
 from flasher.station.events import (
     LineResumed,
     LineStopped,
@@ -316,7 +317,15 @@ class World:
                 bay.process.kill()
             bay.process, bay.run, bay.is_working, bay.shown = None, "", False, None
             bay.changed_at = self.now
-        setups = [WorkerSetup(name, self.bench.recipe.path, {}, {}) for name in self.bays]
+        setups = [
+            WorkerSetup(
+                name,
+                self.bench.recipe.path,
+                {},
+                SocketConfig(name=name, interface="virtual", channel=name),
+            )
+            for name in self.bays
+        ]
         self.station = Station(
             self.bench.store,
             self.bench.recipe,
