@@ -16,9 +16,9 @@ from sqlalchemy import Connection
 
 from flasher.i18n import text
 from flasher.plant.activity import Activity, activities
+from flasher.plant.bounds import Bounds
 from flasher.plant.stations import StationStatus, statuses
 from flasher.protocol.text import printable
-from flasher.station.health import LITTLE_BYTES
 from flasher.station.records.model import RunState, utc_moment
 from flasher.validation import json_keys
 
@@ -60,25 +60,6 @@ class StationCheck:
     text: str
 
 
-@dataclass(frozen=True)
-class Bounds:
-    """Bounds beyond which a check is an alert."""
-
-    yield_min: float = 0.9
-    """Share of units, from 0 to 1."""
-    units_min: int = 20
-    """Fewer units of the shift do not judge its yield."""
-    silent_s: float = 300.0
-    repeats: int = 5
-    """Runs of a socket, one after the other, with the same code."""
-    repeats_within_s: float = 86_400.0
-    """Older runs are not counted."""
-    unsent_s: float = 3600.0
-    """Age of the oldest record that waits."""
-    clock_s: float = 5.0
-    disk_bytes: int = LITTLE_BYTES
-
-
 @json_keys("status activity checks state")
 @dataclass(frozen=True)
 class StationOverview:
@@ -94,7 +75,6 @@ class StationOverview:
         return max((each.state for each in self.checks), key=_ORDER.index, default=CheckState.OK)
 
 
-USUAL_BOUNDS: Final = Bounds()
 _ORDER: Final = (CheckState.OK, CheckState.UNKNOWN, CheckState.ALERT)
 
 
@@ -181,7 +161,7 @@ def _unsent(status: StationStatus, bounds: Bounds) -> _Judged:
 
 def _yield(activity: Activity, bounds: Bounds) -> _Judged:
     shift = activity.shift
-    if shift.units < bounds.units_min or shift.yield_share is None:
+    if shift.units < bounds.units_min:
         sentence = text(
             "too few units in this shift: {count} of {least}",
             count=shift.units,
@@ -191,7 +171,7 @@ def _yield(activity: Activity, bounds: Bounds) -> _Judged:
     sentence = text(
         "{passed} of {units} units of this shift passed", passed=shift.passed, units=shift.units
     )
-    return _alert_if(shift.yield_share < bounds.yield_min), sentence
+    return _alert_if(100 * shift.passed < bounds.yield_min_percent * shift.units), sentence
 
 
 def _repeated(now: datetime, activity: Activity, bounds: Bounds) -> _Judged:

@@ -13,15 +13,8 @@ from sqlalchemy.engine import URL
 
 from flasher.errors import UsageError
 from flasher.i18n import text
-from flasher.plant.alerts import (
-    USUAL_BOUNDS,
-    Bounds,
-    CheckState,
-    StationOverview,
-    alerts,
-    lasting,
-    overviews,
-)
+from flasher.plant.alerts import CheckState, StationOverview, alerts, lasting, overviews
+from flasher.plant.bounds import USUAL_BOUNDS, Bounds
 from flasher.plant.deliveries import DeliveryState
 from flasher.plant.delivery_list import Delivery, DeliveryFilter, deliveries_of, receivers_of
 from flasher.station.records.overview import PAGE_SIZE, Page

@@ -10,16 +10,11 @@ import pytest
 
 from flasher.documents import as_json
 from flasher.plant.activity import Activity, RecentRun, SocketRuns, activities
-from flasher.plant.alerts import (
-    Bounds,
-    CheckKind,
-    CheckState,
-    alerts,
-    judge,
-    overviews,
-)
+from flasher.plant.alerts import CheckKind, CheckState, alerts, judge, overviews
+from flasher.plant.bounds import Bounds
 from flasher.plant.central import Central
 from flasher.plant.stations import StationStatus
+from flasher.station.health import LITTLE_BYTES
 from flasher.station.records.model import RunState, Units, utc_text
 from tests.plant.factory import READER, Plant, Sender
 
@@ -80,8 +75,8 @@ def test_a_station_at_work_is_in_order() -> None:
         (CheckKind.CLOCK, {"clock_offset_s": -5.1}, ALERT),
         (CheckKind.CLOCK, {"clock_offset_s": None}, UNKNOWN),
         (CheckKind.CLOCK, {"silent_s": 301.0}, UNKNOWN),
-        (CheckKind.DISK, {"disk_free_bytes": 500 * 1024**2}, OK),
-        (CheckKind.DISK, {"disk_free_bytes": 500 * 1024**2 - 1}, ALERT),
+        (CheckKind.DISK, {"disk_free_bytes": LITTLE_BYTES}, OK),
+        (CheckKind.DISK, {"disk_free_bytes": LITTLE_BYTES - 1}, ALERT),
         (CheckKind.DISK, {"disk_free_bytes": None}, UNKNOWN),
         (CheckKind.DISK, {"silent_s": 301.0}, UNKNOWN),
         (CheckKind.UNSENT, {"silent_s": 301.0}, UNKNOWN),

@@ -16,7 +16,8 @@ from typing import Any, NoReturn
 import pytest
 
 from flasher.errors import UsageError
-from flasher.plant.alerts import Bounds, CheckKind, CheckState, overviews
+from flasher.plant.alerts import CheckKind, CheckState, overviews
+from flasher.plant.bounds import Bounds
 from flasher.plant.central import Central
 from flasher.plant.claim_list import (
     ClaimFilter,

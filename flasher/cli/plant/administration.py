@@ -11,7 +11,6 @@ from pathlib import Path
 from sqlalchemy import make_url
 
 from flasher.cli.output import Output, counted, duration, utc_time
-from flasher.cli.plant.commands import BoundsOptions
 from flasher.cli.plant.documents import (
     PlantFetchDocument,
     PlantInitDocument,
@@ -21,14 +20,8 @@ from flasher.cli.plant.documents import (
 from flasher.cli.station.place import station_of_plant
 from flasher.cli.station.records import passed_twice_lines
 from flasher.errors import ExitCode
-from flasher.plant.alerts import (
-    Bounds,
-    CheckKind,
-    CheckState,
-    StationOverview,
-    alerts,
-    overviews,
-)
+from flasher.plant.alerts import CheckKind, CheckState, StationOverview, alerts, overviews
+from flasher.plant.bounds import Bounds
 from flasher.plant.central import open_central, plant_location
 from flasher.plant.process import Sending
 from flasher.plant.schema import PLANT_SCHEMA
@@ -115,14 +108,10 @@ def _after(location: Location, roles: Mapping[str, str], created: Collection[str
 # -- status ----------------------------------------------------------------------------------------
 
 
-def bounds_of(options: BoundsOptions) -> Bounds:
-    return Bounds(**vars(options) | {"yield_min": options.yield_min / 100})
-
-
-def status(output: Output, url: str, bounds: BoundsOptions) -> int:
+def status(output: Output, url: str, bounds: Bounds) -> int:
     now = datetime.now().astimezone()
     with open_central(url) as central, central.reading() as connection:
-        found = overviews(connection, bounds_of(bounds), DEFAULT_SHIFTS, now)
+        found = overviews(connection, bounds, DEFAULT_SHIFTS, now)
         twice = passed_twice(connection, TWICE_MAX)
     for each in found:
         output.results(_lines(each))

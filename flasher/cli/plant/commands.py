@@ -22,6 +22,7 @@ from flasher.cli.station.commands import (
     pages_options,
 )
 from flasher.errors import ExitCode
+from flasher.plant.bounds import USUAL_BOUNDS, Bounds
 
 _EXAMPLES: Final = """\
 examples:
@@ -83,42 +84,44 @@ def init() -> None:
 _ALERTS: Final = "bounds of alerts"
 
 
-@dataclass(frozen=True)
-class BoundsOptions:
-    """Options: bounds of the alerts, as in `flasher.plant.alerts.Bounds`."""
-
-    yield_min: Annotated[float, option(
-        "--yield-min", type=values.percent, default=90.0, metavar="PERCENT", panel=_ALERTS,
-        brief=True, help="alert if fewer units of the shift passed in their last run",
-    )]  # fmt: skip
-    units_min: Annotated[int, option(
-        "--yield-units", "units_min", type=values.count, default="20", metavar="N", panel=_ALERTS,
-        help="units of the shift from which its yield is judged",
-    )]  # fmt: skip
-    silent_s: Annotated[float, option(
-        "--silent", "silent_s", type=values.seconds, default=300.0, metavar="S", panel=_ALERTS,
-        brief=True, help="alert if a station has not reported for this time",
-    )]  # fmt: skip
-    repeats: Annotated[int, option(
-        "--repeats", type=values.count, default="5", metavar="N", panel=_ALERTS, brief=True,
+_bounds: Final = option_set(
+    "bounds", Bounds,
+    option(
+        "--yield-min", "yield_min_percent", type=values.percent,
+        default=USUAL_BOUNDS.yield_min_percent, metavar="PERCENT", panel=_ALERTS, brief=True,
+        help="alert if fewer units of the shift passed in their last run",
+    ),
+    option(
+        "--yield-units", "units_min", type=values.count, default=str(USUAL_BOUNDS.units_min),
+        metavar="N", panel=_ALERTS, help="units of the shift from which its yield is judged",
+    ),
+    option(
+        "--silent", "silent_s", type=values.seconds, default=USUAL_BOUNDS.silent_s, metavar="S",
+        panel=_ALERTS, brief=True, help="alert if a station has not reported for this time",
+    ),
+    option(
+        "--repeats", type=values.count, default=str(USUAL_BOUNDS.repeats), metavar="N",
+        panel=_ALERTS, brief=True,
         help="alert if the last N runs of a socket, within 24 hours, ended with the same code",
-    )]  # fmt: skip
-    unsent_s: Annotated[float, option(
-        "--unsent", "unsent_s", type=values.seconds, default=3600.0, metavar="S", panel=_ALERTS,
-        help="alert if a record has waited at its station for longer",
-    )]  # fmt: skip
-    clock_s: Annotated[float, option(
-        "--clock", "clock_s", type=values.seconds, default=5.0, metavar="S", panel=_ALERTS,
+    ),
+    option(
+        "--unsent", "unsent_s", type=values.seconds, default=USUAL_BOUNDS.unsent_s, metavar="S",
+        panel=_ALERTS, help="alert if a record has waited at its station for longer",
+    ),
+    option(
+        "--clock", "clock_s", type=values.seconds, default=USUAL_BOUNDS.clock_s, metavar="S",
+        panel=_ALERTS,
         help="alert if a station's clock differs from the database's by more",
-    )]  # fmt: skip
-    disk_bytes: Annotated[int, option(
-        "--disk", "disk_bytes", type=values.number, default="500M", metavar="BYTES", panel=_ALERTS,
-        help="alert if a station's disk has less free space",
-    )]  # fmt: skip
+    ),
+    option(
+        "--disk", "disk_bytes", type=values.number, default=f"{USUAL_BOUNDS.disk_bytes >> 20}M",
+        metavar="BYTES", panel=_ALERTS, help="alert if a station's disk has less free space",
+    ),
+)  # fmt: skip
 
 
 @plant.action("status")
-@option_set("bounds", BoundsOptions)
+@_bounds
 @_database_option
 @_actions.calls("administration.status")
 def status() -> None:
@@ -221,7 +224,7 @@ def report() -> None:
     help="address of the pages; a port alone: on this computer only",
 )  # fmt: skip
 @pages_options
-@option_set("bounds", BoundsOptions)
+@_bounds
 @_database_option
 @_actions.calls("reading.pages", also=("The supervisor pages", "web"))
 def pages() -> None:

@@ -10,14 +10,13 @@ from pathlib import Path
 
 from flasher.cli.bar import Bar
 from flasher.cli.output import Output, counted
-from flasher.cli.plant.administration import bounds_of
-from flasher.cli.plant.commands import BoundsOptions
 from flasher.cli.plant.documents import PlantUnitsDocument
 from flasher.cli.station.commands import Address, PagesOptions, RecordsOptions, ReportOptions
 from flasher.cli.station.maintenance import problem_lines
 from flasher.cli.station.place import open_to_read
 from flasher.cli.station.records import report as station_report
 from flasher.errors import ExitCode
+from flasher.plant.bounds import Bounds
 from flasher.plant.store import PlantStore, cache_folder
 from flasher.plant.verify import PlantExaminer
 from flasher.protocol.text import printable
@@ -120,12 +119,10 @@ def report(output: Output, options: ReportOptions, url: str) -> int:
     return station_report(output, options, records_of_plant(url), PlantStore)
 
 
-def pages(
-    output: Output, web: Address, pages: PagesOptions, url: str, bounds: BoundsOptions
-) -> int:
+def pages(output: Output, web: Address, pages: PagesOptions, url: str, bounds: Bounds) -> int:
     from flasher.cli.station.pages import serve  # noqa: PLC0415  an extra
     from flasher.web.plant import PLANT_PAGES, STATIONS, PlantPages  # noqa: PLC0415  an extra
 
-    make = partial(PlantPages, bounds=bounds_of(bounds))
+    make = partial(PlantPages, bounds=bounds)
     paths = dict.fromkeys([STATIONS, *PLANT_PAGES])
     return serve(output, web, pages, records_of_plant(url), PlantStore, make, tuple(paths))
