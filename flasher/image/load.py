@@ -96,7 +96,8 @@ def load(
     Raises ImageError if the file cannot be used; UsageError if it does not exist, is not a regular
     file, or the options contradict each other.
     """
-    _check_filled(fill_gaps_up_to)
+    if fill_gaps_up_to < 0:
+        raise UsageError(f"gaps cannot be filled up to {fill_gaps_up_to} bytes")
     content = read(path, stream=stream, format=format, base=base, range_=range_)
     sparse = content.sparse
     data, first = sparse.join(fill_gaps_up_to)
@@ -187,11 +188,6 @@ def _check_options(form: str | None, base: int | None, range_: tuple[int, int] |
             f"the range {range_[0]:#x}:{range_[1]:#x} is empty or not inside 32-bit addresses",
             remedy="Give START:END with END one past the last byte.",
         )
-
-
-def _check_filled(fill_gaps_up_to: int) -> None:
-    if fill_gaps_up_to < 0:
-        raise UsageError(f"gaps cannot be filled up to {fill_gaps_up_to} bytes")
 
 
 def _detect(head: bytes, source: str) -> Format:

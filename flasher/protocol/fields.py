@@ -299,8 +299,11 @@ class Content:
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        declared = {name: value for name, value in vars(cls).items() if _is_field(value)}
-        cls.LAYOUT = tuple((name, value.metadata[_CODEC]) for name, value in declared.items())
+        cls.LAYOUT = tuple(
+            (name, value.metadata[_CODEC])
+            for name, value in vars(cls).items()
+            if isinstance(value, dataclasses.Field) and _CODEC in value.metadata
+        )
         cls.SIZE_BYTES = sum(codec.size_bytes for _, codec in cls.LAYOUT)
 
     def data(self) -> bytes:
@@ -332,14 +335,8 @@ class Content:
                 yield label(name, codec), codec.show(value), codec.unit
 
 
-def _is_field(value: object) -> bool:
-    return isinstance(value, dataclasses.Field) and _CODEC in value.metadata
-
-
 _UNIT_SUFFIXES: Final = {"mV": "_mv", "V": "_v", "mA": "_ma", "mAh": "_mah", "°C": "_c",
                          "%": "_percent", "h": "_h", "min": "_min", "B": "_bytes"}  # fmt: skip
-
-
 _OWN_LABELS: Final = {
     "full_capacity": "full-charge capacity",
     "latest_charge_interval": "most recent charge interval",

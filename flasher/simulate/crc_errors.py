@@ -56,7 +56,7 @@ class ErrorsOfSize:
         message = message_of(self.size)
         encoded = encode(message)
         wire = int.from_bytes(encoded, "big")
-        counts = received("1 bit", message, self._single_bits())
+        counts = received("1 bit", message, (1 << bit for bit in range(8 * self.size)))
         # Enough of it to complete a message whose length has grown.
         following = encoded * (MESSAGE_MAX_SIZE // self.size + 1)
         counts += received("length", message, self._other_lengths(wire), following)
@@ -67,10 +67,6 @@ class ErrorsOfSize:
             if kind.endswith(_UNDETECTED)
         ]
         return counts, violations
-
-    def _single_bits(self) -> Iterator[int]:
-        for bit in range(8 * self.size):
-            yield 1 << bit
 
     def _other_lengths(self, wire: int) -> Iterator[int]:
         """Errors of 2 and 3 bits that change the length in both places alike."""

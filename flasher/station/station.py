@@ -863,13 +863,12 @@ class Station:
     def _publish_labels(self) -> None:
         for job, reason in () if self._labels is None else self._labels.take():
             if reason:
-                self._label_failed(job.socket, job.serial, reason)
+                remedy = text(
+                    "Repair the printer, then scan REPRINT {serial}.", serial=printable(job.serial)
+                )
+                self.emit(LabelFailed(job.socket, job.serial, reason, remedy))
             else:
                 self.emit(LabelPrinted(job.socket, job.serial, job.is_reprint))
-
-    def _label_failed(self, socket: str, serial: str, reason: str) -> None:
-        remedy = text("Repair the printer, then scan REPRINT {serial}.", serial=printable(serial))
-        self.emit(LabelFailed(socket, serial, reason, remedy))
 
     def _not_saved(
         self, socket: str, serial: str, run_id: RunId | None, error: RecordError
