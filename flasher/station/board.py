@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -52,6 +52,7 @@ STEPS: Final = {
     StepName.SAVE: text("save"),
 }
 """Steps of a run, for people."""
+NAMES_SHOWN: Final = 3
 _PAGES_MAX: Final = 100
 """Maximum number of pages whose last reply is stored."""
 NO_BADGES: Final = text("No badge table: operator names are not checked.")
@@ -165,6 +166,14 @@ class Board:
     broken: dict[str, str] = field(default_factory=dict)
     """Reasons of the sockets that will not work until the station is restarted or they get another
     recipe, by socket."""
+
+    @property
+    def unprinted_words(self) -> str:
+        """Units whose labels were not printed, and what to do; "" without any."""
+        if not self.unprinted:
+            return ""
+        names, first = few(self.unprinted), printable(next(iter(self.unprinted)))
+        return text("not printed: {names}; scan REPRINT {first}", names=names, first=first)
 
     @property
     def last_reply(self) -> str:
@@ -342,6 +351,7 @@ class Board:
             case RunEnded(run):
                 self.ended[run.serial] = run
                 row.code = "" if run.state is RunState.PASS else run.code
+                self.unprinted.pop(run.serial, None)  # its label is reported after its end
             case _:
                 pass
 
@@ -380,6 +390,13 @@ def device_event_text(event: LabelFailed | ScannerChanged) -> str:
     if event.is_ready:
         return text("Scanner {name} is ready.", name=name)
     return text("Scanner {name} cannot be read: {why}", name=name, why=shown(event.reason))
+
+
+def few(names: Collection[str]) -> str:
+    """The first names, and the number of the others."""
+    first = ", ".join(map(printable, list(names)[:NAMES_SHOWN]))
+    more = len(names) - NAMES_SHOWN
+    return text("{first} and {more} more", first=first, more=more) if more > 0 else first
 
 
 def shown(text: str) -> str:

@@ -10,15 +10,13 @@ from pathlib import Path
 from typing import Final
 
 from flasher.i18n import text
-from flasher.protocol.text import printable
-from flasher.station.board import Board
+from flasher.station.board import Board, few
 
 LITTLE_BYTES: Final = 500 * 1024 * 1024
 """Less free disk space than this is reported."""
 CLOCK_SHIFT_MAX_S: Final = 5.0
 """Greatest change of UTC relative to the monotonic clock since the start of the station."""
 LOOK_EVERY_S: Final = 5.0
-NAMES_SHOWN: Final = 3
 
 
 @dataclass(frozen=True)
@@ -64,13 +62,12 @@ class HealthWatch:
         sentence = board.records_fault or text("every run is saved")
         checks = [HealthCheck(text("records"), is_good=not board.records_fault, text=sentence)]
         if board.unprinted:
-            sentence = text("not printed: {names}", names=_few(board.unprinted))
-            checks.append(HealthCheck(text("labels"), is_good=False, text=sentence))
+            checks.append(HealthCheck(text("labels"), is_good=False, text=board.unprinted_words))
         if board.lost_scanners:
-            sentence = text("cannot be read: {names}", names=_few(board.lost_scanners))
+            sentence = text("cannot be read: {names}", names=few(board.lost_scanners))
             checks.append(HealthCheck(text("scanners"), is_good=False, text=sentence))
         if unkept := self._unkept():
-            sentence = text("not stored yet in: {names}", names=_few(unkept))
+            sentence = text("not stored yet in: {names}", names=few(unkept))
             checks.append(HealthCheck(text("heads"), is_good=False, text=sentence))
         return (*checks, *self._seen)
 
@@ -88,10 +85,3 @@ class HealthWatch:
             return HealthCheck(text("clock"), is_good=True, text=text("not set since the start"))
         sentence = text("set by {seconds:+.0f} s since the start", seconds=shift_s)
         return HealthCheck(text("clock"), is_good=False, text=sentence)
-
-
-def _few(names: Collection[str]) -> str:
-    """The first names, and the number of the others."""
-    first = ", ".join(map(printable, list(names)[:NAMES_SHOWN]))
-    more = len(names) - NAMES_SHOWN
-    return text("{first} and {more} more", first=first, more=more) if more > 0 else first

@@ -21,6 +21,7 @@ from flasher.i18n import text
 from flasher.protocol.text import printable
 from flasher.station.config import LabelConfig
 from flasher.station.label_template import LabelTemplate
+from flasher.station.records.model import RunRecord
 
 BACKLOG_MAX: Final = 100
 """Maximum number of waiting labels; more are refused."""
@@ -36,10 +37,11 @@ class NotPrinted(Exception):  # noqa: N818  not an error of the station
 
 @dataclass(frozen=True)
 class LabelJob:
-    """A label to print for a unit, with the values of its template."""
+    """A label to print for a run that passed, with the values of its template."""
 
+    run: RunRecord
     socket: str
-    serial: str
+    """Socket that shows the result; empty: none."""
     values: dict[str, object]
     is_reprint: bool = False
 

@@ -45,6 +45,8 @@ class ActiveRun:
     claim: Claim
     begun_s: float
     admission: Admission | None = None
+    gets_label: bool = False
+    """A PASS gets a label."""
     where: str = StepName.CONNECT.value
     """Active step, with its target."""
     journal_error: str = ""
@@ -69,7 +71,7 @@ def save(store: Store, run: ActiveRun, now_s: Callable[[], float]) -> RunResult:
         store.step(run.claim.run_id, StepName.SAVE.value, state, duration_s=duration_s)
         run.is_save_noted = True
     try:
-        store.finish(run.claim.run_id, _ending(run, run.result))
+        store.finish(run.claim.run_id, _ending(run, run.result), gets_label=run.gets_label)
     except RuleBrokenError as error:
         # The records refuse this PASS: the unit gets no verdict, since the program has a bug.
         run.result = _worse(run.result, Code.INTERNAL, error.what)

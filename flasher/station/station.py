@@ -177,6 +177,8 @@ class Station:
         self._gate.recipes = self.recipes
         self._has_badges = crew is not None
         self._labels = labels
+        self._unlabelled: set[str] = set()
+        """Units that have passed, and whose label is not known to be printed."""
         self.supervisor = WorkerSupervisor(setups, self.clock.monotonic_s, launch)
         self._runs: dict[str, ActiveRun] = {}
         """Claimed runs that are not saved yet, by socket."""
@@ -219,6 +221,7 @@ class Station:
         self._is_open = True
         if self._labels is not None:
             self._labels.start(self._wake)
+        unlabelled = () if self._labels is None else self.store.read.unlabelled(self.store.station)
         rule = self.recipe.recipe
         self._note_recipes()
         self._find_released()
@@ -237,6 +240,8 @@ class Station:
         for name, each in self.recipes.items():
             if each is not self.recipe:
                 self._emit_recipe(name, each)
+        for run in unlabelled:
+            self._label_failed(run, _no_label(run))
         if are_mixed and self._has_badges:
             self.line.stop(
                 "VIRTUAL_MIXED",
@@ -506,9 +511,11 @@ class Station:
         while self._notes:
             self._audit(*self._notes.popleft())
 
-    def _audit(self, what: AuditEvent, data: Mapping[str, str]) -> None:
+    def _audit(
+        self, what: AuditEvent, data: Mapping[str, str], run_id: RunId | None = None
+    ) -> None:
         try:
-            self.store.note(what, data)
+            self.store.note(what, data, run_id)
         except RecordError as error:
             self._not_saved("", "", None, error)
             self.line.stop(Code.RECORD_NOT_SAVED.name, error.what, error.remedy)
@@ -719,7 +726,13 @@ class Station:
         trace = self.store.files.spooled(claim.run_id)
         at = self.line.sockets[socket]
         claim = replace(claim, trace=trace, presence=at.presence_number, has_card=at.has_card)
-        self._runs[socket] = ActiveRun(claim, self._now, order.admission)
+        gets_label = (
+            self._labels is not None
+            and self._labels.prints_each
+            and not order.is_virtual
+            and claim.kind not in (RunKind.GOLDEN, RunKind.VERIFY_ONLY)
+        )
+        self._runs[socket] = ActiveRun(claim, self._now, order.admission, gets_label)
         return RunStarted(socket, claim.serial, claim.run_id, claim.kind, order.is_virtual)
 
     def _life(self, serial: str) -> UnitLife | None:
@@ -829,18 +842,21 @@ class Station:
             self.emit(FiguresChanged(self.figures))
         if is_pass:
             self._note_golden(socket, claim)
-            self._print(saved.run)
+            if run.gets_label or claim.serial in self._unlabelled:
+                self._print(saved.run)
         return True
 
     # -- labels (without effect on verdicts) -------------------------------------------------------
 
     def _print(self, run: RunRecord) -> None:
         """Print the label of a unit whose PASS is on disk."""
-        if self._labels is None or not self._labels.prints_each:
+        if self._labels is None:
             return
-        if _not_labelled(run) is None and run.kind is not RunKind.VERIFY_ONLY:
-            groups = groups_by(self.recipes[run.socket].content, run.serial)
-            self._labels.submit(LabelJob(run.socket, run.serial, values_of(run, groups)))
+        if run.is_unchecked:
+            self._label_failed(run, _no_label(run))
+            return
+        groups = groups_by(self.recipes[run.socket].content, run.serial)
+        self._labels.submit(LabelJob(run, run.socket, values_of(run, groups)))
 
     def _reprint(self, serial: str, data: Mapping[str, str]) -> Refused | None:
         """Print a label again; returns the refusal, or None."""
@@ -857,18 +873,25 @@ class Station:
             self.store.note(AuditEvent.REPRINT, data)
         except RecordError as error:
             return Refused(Code.RECORD_NOT_SAVED.name, _error_line(error), error.remedy)
-        self._labels.submit(LabelJob("", serial, values_of(last.run, groups), is_reprint=True))
+        self._labels.submit(LabelJob(last.run, "", values_of(last.run, groups), is_reprint=True))
         return None
 
     def _publish_labels(self) -> None:
         for job, reason in () if self._labels is None else self._labels.take():
+            serial = job.run.serial
             if reason:
-                remedy = text(
-                    "Repair the printer, then scan REPRINT {serial}.", serial=printable(job.serial)
-                )
-                self.emit(LabelFailed(job.socket, job.serial, reason, remedy))
+                shown = printable(serial)
+                remedy = text("Repair the printer, then scan REPRINT {serial}.", serial=shown)
+                self._label_failed(job.run, Refused("", reason, remedy), job.socket)
             else:
-                self.emit(LabelPrinted(job.socket, job.serial, job.is_reprint))
+                self._unlabelled.discard(serial)
+                self._audit(AuditEvent.LABELLED, {"serial": serial}, job.run.run_id)
+                self.emit(LabelPrinted(job.socket, serial, job.is_reprint))
+
+    def _label_failed(self, run: RunRecord, why: Refused, socket: str | None = None) -> None:
+        self._unlabelled.add(run.serial)
+        socket = run.socket if socket is None else socket
+        self.emit(LabelFailed(socket, run.serial, why.reason, why.remedy))
 
     def _not_saved(
         self, socket: str, serial: str, run_id: RunId | None, error: RecordError
@@ -922,6 +945,22 @@ def _not_labelled(run: RunRecord) -> Refused | None:
             "NO_PRODUCT", text("It is not a product."), text("Only products get a label.")
         )
     return None
+
+
+def _no_label(run: RunRecord) -> Refused:
+    """Reason why no label of a PASS was printed, or is known to be, and what to do."""
+    serial = printable(run.serial)
+    if run.is_unchecked:
+        return Refused(
+            Refusal.NOT_CHECKED.value,
+            text("It was not checked whether it has passed at another station."),
+            text("Scan it again when the plant answers; or scan REPRINT {serial}.", serial=serial),
+        )
+    return Refused(
+        "NOT_PRINTED",
+        text("The station ended before its label was reported as printed."),
+        text("If it has none, scan REPRINT {serial}.", serial=serial),
+    )
 
 
 def _error_line(error: RecordError) -> str:

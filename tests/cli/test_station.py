@@ -306,7 +306,7 @@ def test_a_label_that_waits_when_the_pipe_has_ended_is_dropped(
 def test_records_that_cannot_be_written_stop_the_line_and_nothing_passes(
     flasher: Flasher, recipe: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def finish(*_: object) -> None:
+    def finish(*_: object, **_more: object) -> None:
         raise DiskFullError("RECORD NOT SAVED: the disk is full.", remedy="Make room.")
 
     monkeypatch.setattr(Store, "finish", finish)

@@ -11,6 +11,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -32,11 +33,12 @@ from flasher.station.label_printer import LabelJob, LabelPrinter, NotPrinted, pr
 from flasher.station.label_template import LabelTemplate, sample_of, values_of
 from flasher.station.operators import Crew, Person, Role
 from flasher.station.records.errors import DiskFullError
-from flasher.station.records.model import RunState
+from flasher.station.records.model import Measurement, RunState, StepName
 from flasher.station.records.store import Store
 from tests.loops import each
 from tests.station.factory import SERIAL, USUAL, Bench
-from tests.station.line_bench import LineBench
+from tests.station.line_bench import LineBench, tried
+from tests.station.test_plant_answers import Plant
 
 ZPL = "^XA^FO40,40^FD{{ serial }} {{ lot }} {{ match.week }}^FS^XZ\n"
 OTHER = "W2605003"
@@ -106,7 +108,7 @@ def test_no_label_before_the_pass_is_on_disk(bench: Bench, monkeypatch: pytest.M
     line = LineBench(bench, labels=printer.labels)
     real = Store.finish
 
-    def finish(*_: object) -> None:
+    def finish(*_: object, **_more: object) -> None:
         raise DiskFullError("RECORD NOT SAVED: the disk is full.", remedy="Make room.")
 
     monkeypatch.setattr(Store, "finish", finish)
@@ -165,20 +167,24 @@ def test_the_time_limit_holds_for_a_printer_that_knows_none(bench: Bench) -> Non
 
     labels = LabelPrinter(template(bench), hang, limit_s=0.05)
     labels.start(done.release)
-    values = sample_of(bench.recipe.recipe, "line-2")
+    run = bench.store.read.run(bench.make()).run
+
+    def job(serial: str) -> LabelJob:
+        return LabelJob(replace(run, serial=serial), "A", values_of(run, {"week": "05"}))
+
     for serial in ("1", "2"):
-        labels.submit(LabelJob("A", serial, values))
+        labels.submit(job(serial))
         assert done.acquire(timeout=LIMIT_S)
-    assert [(job.serial, reason) for job, reason in labels.take()] == [
+    assert [(job.run.serial, reason) for job, reason in labels.take()] == [
         ("1", "The printer took longer than 0.05 s."),
         ("2", "The printer took longer than 0.05 s."),
     ]
     assert begun.acquire(blocking=False)
     assert not begun.acquire(blocking=False), "two labels at once"
     goes_on.set()
-    labels.submit(LabelJob("A", "3", values))
+    labels.submit(job("3"))
     assert done.acquire(timeout=LIMIT_S)
-    assert [(job.serial, reason) for job, reason in labels.take()] == [("3", "")]
+    assert [(job.run.serial, reason) for job, reason in labels.take()] == [("3", "")]
     labels.close()
 
 
@@ -208,7 +214,7 @@ def test_what_is_not_printed_stays_on_the_page(tmp_path: Path, bench: Bench) -> 
     failed = LabelFailed("A", "W1", "No paper.", "Put some in.")
     check = watch.look(Board(unprinted=dict.fromkeys(("W1", "W2", "W3", "W4"), failed)))[1]
     assert (check.name, check.is_good) == ("labels", False)
-    assert check.text == "not printed: W1, W2, W3 and 1 more"
+    assert check.text == "not printed: W1, W2, W3 and 1 more; scan REPRINT W1"
 
 
 def test_a_template_that_fails_on_one_unit_is_reported(bench: Bench) -> None:
@@ -342,6 +348,92 @@ def test_only_what_is_asked_for_is_printed_where_it_is_set_so(bench: Bench) -> N
     line.scan(f"REPRINT {SERIAL}")
     finished(line)
     assert [event.is_reprint for event in line.of(LabelPrinted)] == [True]
+
+
+# -- labels that are due --------------------------------------------------------------------------
+
+
+def killed_before_the_label(bench: Bench, *serials: str) -> None:
+    """Units pass, and the station dies while its printer hangs."""
+
+    def hang(_data: bytes) -> None:
+        threading.Event().wait(LIMIT_S)
+
+    line = LineBench(bench, labels=Printer(bench, hang).labels)
+    for serial in serials:
+        line.make("A", serial)
+        line.leave("A")
+
+
+def missing(line: LineBench) -> list[str]:
+    board = Board()
+    for event in line.events:
+        board.apply(event)
+    return list(board.unprinted)
+
+
+def test_the_next_start_names_each_label_that_a_kill_has_lost(bench: Bench) -> None:
+    bench.make()  # without a printer: no label is due
+    killed_before_the_label(bench, OTHER, "W2605004")
+    for _ in range(2):  # not lost by another kill
+        line = LineBench(bench, labels=Printer(bench).labels)
+        assert missing(line) == [OTHER, "W2605004"]
+    failed = line.of(LabelFailed)[0]
+    assert failed.reason == "The station ended before its label was reported as printed."
+    assert failed.remedy == f"If it has none, scan REPRINT {OTHER}."
+    line.scan(f"REPRINT {OTHER}")
+    finished(line)
+    assert missing(line) == ["W2605004"]
+    assert bench.store.examine().problems == ()
+    assert missing(LineBench(bench, labels=Printer(bench).labels)) == ["W2605004"]
+    assert missing(LineBench(bench)) == []
+
+
+def test_a_unit_that_is_verified_gets_the_label_that_it_lacks(bench: Bench) -> None:
+    bench.use(USUAL.replace("revision", 'duplicate = "verify-only"\nrevision', 1))
+    killed_before_the_label(bench, SERIAL)
+    printer = Printer(bench)
+    line = LineBench(bench, labels=printer.labels)
+    line.scan(SERIAL)
+    line.arrive("A")
+    line.ask("A", tried(StepName.VERIFY), (Measurement("bms version", text="V1"),))
+    line.end("A")
+    finished(line)
+    assert [event.serial for event in line.of(LabelPrinted)] == [SERIAL]
+    assert missing(LineBench(bench, labels=Printer(bench).labels)) == []
+
+
+def test_a_unit_that_failed_since_gets_none(bench: Bench) -> None:
+    bench.use(USUAL.replace("revision", 'duplicate = "verify-only"\nrevision', 1))
+    killed_before_the_label(bench, SERIAL)
+    line = LineBench(bench, labels=Printer(bench).labels)
+    line.scan(SERIAL)
+    line.arrive("A")
+    line.end("A", RunState.FAIL, "NO_ANSWER")
+    finished(line)
+    assert missing(line) == []
+    assert missing(LineBench(bench, labels=Printer(bench).labels)) == []
+
+
+def test_a_pass_whose_duplicates_were_not_checked_gets_no_label_by_itself(bench: Bench) -> None:
+    printer = Printer(bench)
+    plant = Plant(bench, labels=printer.labels)
+    line = plant.line
+    plant.scan()
+    bench.clock.go_on(4.0)
+    line.turn()
+    line.work("A")
+    line.end("A")
+    assert line.last(RunEnded).run.is_unchecked
+    failed = line.last(LabelFailed)
+    assert failed.reason == "It was not checked whether it has passed at another station."
+    line.station.close()
+    assert printer.came.empty()
+    plant = Plant(bench, labels=Printer(bench).labels)
+    assert plant.line.last(LabelFailed).reason == failed.reason
+    plant.line.scan(f"REPRINT {SERIAL}")
+    finished(plant.line)
+    assert plant.line.last(LabelPrinted).is_reprint
 
 
 # -- the template ---------------------------------------------------------------------------------

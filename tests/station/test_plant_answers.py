@@ -11,6 +11,7 @@ from flasher.cli.station.records import certificate
 from flasher.station.certificate_check import check_certificate
 from flasher.station.events import OperatorPrompted, RunEnded, ScanRefused, SocketState
 from flasher.station.gate import Gate
+from flasher.station.label_printer import LabelPrinter
 from flasher.station.recipe_offers import Offers
 from flasher.station.records.errors import Refusal
 from flasher.station.records.model import (
@@ -32,7 +33,14 @@ THERE = "2026-05-17T08:00:00.000000Z"
 class Plant:
     """A station whose plant answers when the test says so."""
 
-    def __init__(self, bench: Bench, *, question: bool = False, needs_golden: bool = False) -> None:
+    def __init__(
+        self,
+        bench: Bench,
+        *,
+        question: bool = False,
+        needs_golden: bool = False,
+        labels: LabelPrinter | None = None,
+    ) -> None:
         self.claims, self.question = _Claims(), _Question()
         self.threads: list[Callable[[], None]] = []
         gate = Gate(
@@ -42,7 +50,7 @@ class Plant:
             bench.clock.monotonic_s,
             start=self.threads.append,
         )
-        self.line = LineBench(bench, gate=gate, needs_golden=needs_golden)
+        self.line = LineBench(bench, gate=gate, needs_golden=needs_golden, labels=labels)
 
     def answer(self) -> None:
         self.threads.pop(0)()

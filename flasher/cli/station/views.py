@@ -208,6 +208,8 @@ def _foot(board: Board, typed: str | None, width: int, height: int) -> list[Text
         failures = board.figures.failures.items()
         lines[1] = _cut(figures_line(board.figures), "bold")
         lines[2] = _cut("  ".join(f"{printable(code)} {count:,}" for code, count in failures))
+    if board.unprinted:
+        lines.append(_cut(f"labels {board.unprinted_words}", "bold red"))
     if board.stopped is not None:
         room = max(2, height // 4)
         lines += [

@@ -21,7 +21,7 @@ from flasher.station.records import chain, schema
 from flasher.station.records.database import Database
 from flasher.station.records.errors import NotFoundError, RecordError, UnprovenError
 from flasher.station.records.files import FileStore
-from flasher.station.records.model import RunState, utc_text
+from flasher.station.records.model import AuditEvent, RunState, utc_text
 from flasher.station.records.rows import find_or_insert, insert
 from flasher.station.records.store import Store
 
@@ -98,6 +98,8 @@ def bring_in(
             elif run_id is not None and row["event"] in chain.ENDINGS:
                 event = row["event"]
                 data |= {"state": added[row["run_id"]], "digests": digests[run_id]}
+            elif run_id is not None and row["event"] == AuditEvent.LABELLED.value:
+                event = row["event"]
             trail.append(now, event, data, run_id)
         for run_id, content in contents.items():
             if content["run"]["state"] == RunState.RUNNING.value:

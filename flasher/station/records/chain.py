@@ -53,6 +53,8 @@ RUNS_LEFT_FREE: Final = 100_000
 """Numbers that a takeover leaves to the runs of the PC before: two months at a unit a minute."""
 RECIPE: Final = "recipe"
 """A recipe was used for the first time."""
+LABEL_DUE: Final = "label_due"
+"""Key of a FINISHED row: the station prints a label for this PASS; LABELLED states that it has."""
 ENDINGS: Final = (FINISHED, INTERRUPTED)
 """Rows that hold the digests of a run that ended."""
 _KEYS: Final = (BEGUN, KEY_ROTATED, KEY_LOST)

@@ -86,6 +86,8 @@ RUN_QUERY: Final = (
 """Query of runs with the columns of `RunRecord`."""
 _NAMED: Final = ("unit", "station", "socket", "operator", "recipe")
 """Columns with a name that every run has."""
+LABELS_LOOKED_BACK: Final = 10_000
+"""Newest runs of which `Records.unlabelled` looks for labels."""
 
 
 class Records:
@@ -221,6 +223,45 @@ class Records:
         )
         with self._database.reading() as connection:
             return [chain.data_of(data) for data in connection.execute(query).scalars()]
+
+    def unlabelled(self, station: str) -> list[RunRecord]:
+        """Runs of a station, of its newest ones, whose label is not known to be printed. A unit
+        counts if its last run passed, and no later run of it has got the label.
+        """
+        audit, of_unit = schema.audit.c, schema.run.alias().c
+        own = select(schema.station.c.id).where(schema.station.c.name == station)
+        newest = (
+            select(audit.run_id, audit.data)
+            .where(audit.event == chain.FINISHED, audit.station_id == own.scalar_subquery())
+            .order_by(audit.id.desc())
+            .limit(LABELS_LOOKED_BACK)
+        )
+        last_state = (
+            select(of_unit.state)
+            .where(of_unit.unit_id == _RUN.unit_id)
+            .order_by(of_unit.id.desc())
+            .limit(1)
+        )
+        labelled = (
+            select(audit.id)
+            .join_from(of_unit.id.table, schema.audit, audit.run_id == of_unit.id)
+            .where(
+                of_unit.unit_id == _RUN.unit_id,
+                of_unit.id >= _RUN.id,
+                audit.event == AuditEvent.LABELLED.value,
+            )
+        )
+        query = RUN_QUERY.where(
+            last_state.scalar_subquery() == RunState.PASS.value, ~labelled.exists()
+        ).order_by(_RUN.id)
+        with self._database.reading() as connection:
+            rows = connection.execute(newest)
+            due = sorted(row.run_id for row in rows if chain.LABEL_DUE in row.data)
+            return [
+                run
+                for some in batches(due)
+                for run in runs_of(connection, query.where(_RUN.id.in_(some)), ())
+            ]
 
     def head_of(self, run_id: RunId) -> ChainHead | None:
         """The signed audit row of a finished run; None without one."""

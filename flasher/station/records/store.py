@@ -318,8 +318,9 @@ class Store:
 
     # -- ending -----------------------------------------------------------------------------------
 
-    def finish(self, run_id: RunId, ending: RunResult) -> None:
+    def finish(self, run_id: RunId, ending: RunResult, *, gets_label: bool = False) -> None:
         """Save the end of a run in one transaction. Only after it returns may PASS be shown.
+        `gets_label`: the station prints a label for a PASS.
 
         May be called again with the same ending after an error. Raises RuleBrokenError for an
         unproven PASS (verification below the recipe's, no trace, a failed step, an unverified
@@ -365,6 +366,7 @@ class Store:
                 # The weakest of all targets.
                 verification_reached=None if not reached or None in reached else min(reached),
                 log_sha256=ending.trace_sha256,
+                gets_label=gets_label and ending.outcome is RunState.PASS,
             )
 
     def note(self, event: AuditEvent, data: Mapping[str, Any], run_id: RunId | None = None) -> None:
@@ -442,7 +444,13 @@ class Store:
 
 
 def _end_run(
-    trail: Trail, run_id: int, attached: Iterable[AttachmentFile], now: datetime, **values: Any
+    trail: Trail,
+    run_id: int,
+    attached: Iterable[AttachmentFile],
+    now: datetime,
+    *,
+    gets_label: bool = False,
+    **values: Any,
 ) -> None:
     """End a run, with its attachments and a signed audit row."""
     connection, run = trail.connection, schema.run
@@ -454,5 +462,6 @@ def _end_run(
     connection.execute(update(run).where(run.c.id == run_id).values(ended_at=ended_at, **values))
     interrupted = values["state"] == RunState.INTERRUPTED.value
     event = chain.INTERRUPTED if interrupted else chain.FINISHED
-    digests = digests_of(connection, [run_id])[run_id]
-    trail.append(now, event, {"state": values["state"], "digests": digests}, run_id)
+    data = {"state": values["state"], "digests": digests_of(connection, [run_id])[run_id]}
+    due = {chain.LABEL_DUE: True} if gets_label else {}
+    trail.append(now, event, {**data, **due}, run_id)
