@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Final, TypedDict
 
 from flasher import events
 from flasher.bus.health import LinkHealth, TroubleKind, bus_off_error
-from flasher.bus.link import SEND_LIMIT_S, Clock, Link
-from flasher.driver import drive
+from flasher.bus.link import SEND_LIMIT_S, Clock, Link, suspended_s
+from flasher.driver import STALL_S, drive
 from flasher.errors import (
     BusError,
     ErrorCode,
@@ -457,7 +457,15 @@ class Procedures:
                 f"The plan is for {plan.bitrate_bps / 1000:g} kbit/s, the bus runs at {rate}.",
                 remedy="Make the plan with bitrate_bps of the connection.",
             )
-        return self._session(UpgradeSession(plan, chosen, level, identity or Identity()), chosen)
+        slept_s = suspended_s()
+        session = UpgradeSession(plan, chosen, level, identity or Identity())
+        result = self._session(session, chosen)
+        slept_s = suspended_s() - slept_s
+        if slept_s <= STALL_S:
+            return result
+        # Nothing was received then, and another unit may have been connected.
+        unobserved_s = result.outcome.unobserved_s + slept_s
+        return replace(result, outcome=replace(result.outcome, unobserved_s=unobserved_s))
 
     def _session(self, session: UpgradeSession, options: UpgradeOptions) -> Result:
         stalls_s: list[float] = []

@@ -115,8 +115,9 @@ class Outcome:
     """A silent device got an update command, in case an earlier upgrade left it in its transfer
     (R26)."""
     unobserved_s: float = 0.0
-    """Time since the update command in which the adapter was away, in seconds: whether another tool
-    wrote to the device then is not known, and the device cannot be asked."""
+    """Time since the update command in which the adapter was away, and in which this computer was
+    suspended, in seconds: whether another tool wrote to the device then, or another unit was
+    connected, is not known, and the device cannot be asked."""
     frame_gap_s: float = 0.0
     """Silence between the frames of a message, as chosen by the options."""
     was_answered_otherwise: bool = False

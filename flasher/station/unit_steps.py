@@ -291,7 +291,7 @@ class UnitSteps:
         self._journal.verified(write, result.running_version)
         self._flashed.add(name)
         away_s = result.outcome.unobserved_s
-        away = f"; unobserved for {away_s:.1f} s, as the adapter was away" if away_s else ""
+        away = f"; unobserved for {away_s:.1f} s" if away_s else ""
         return f"{wording(result.outcome.ending)}; boot version {result.outcome.boot_version}{away}"
 
     def _check_flashed(self) -> None:

@@ -69,6 +69,18 @@ def test_the_whole_job_is_one_call(tmp_path: Path, target: Any) -> None:
 
 
 @pytest.mark.usefixtures("at_once")
+@each("slept_s, unobserved_s", [(60.0, 60.0), (0.1, 0.0)])
+def test_an_upgrade_in_which_this_computer_was_suspended_was_not_observed(
+    monkeypatch: pytest.MonkeyPatch, slept_s: float, unobserved_s: float
+) -> None:
+    total_s = iter([5.0, 5.0 + slept_s])
+    monkeypatch.setattr("flasher.procedures.suspended_s", lambda: next(total_s))
+    done = flasher.flash(IMAGE, "bms", mock=True)
+    assert done.ok
+    assert done.outcome.unobserved_s == pytest.approx(unobserved_s)
+
+
+@pytest.mark.usefixtures("at_once")
 def test_a_path_may_be_text_and_an_image_may_be_loaded_before(tmp_path: Path) -> None:
     path = tmp_path / "firmware.bin"
     path.write_bytes(DATA)

@@ -352,9 +352,9 @@ def test_a_check_that_refused_in_the_upgrade_is_waived_after_it(
 @pytest.mark.parametrize(
     ("language", "text"),
     [
-        ("en", "the adapter was away for 1.5 s"),
-        ("de", "der Adapter war 1,5 s weg"),
-        ("zh", "适配器断开了 1.5 s"),
+        ("en", "the adapter was away or this computer suspended for 1.5 s"),
+        ("de", "1,5 s lang war der Adapter weg oder dieser Rechner im Ruhezustand"),
+        ("zh", "适配器断开或本计算机休眠了 1.5 s"),
     ],
 )
 def test_time_in_which_the_adapter_was_away_is_a_claim_of_its_own(

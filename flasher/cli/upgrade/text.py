@@ -238,8 +238,8 @@ def summary_lines(result: Result, plan: Plan) -> list[str]:
     whole = f"{counted(figures.attempts, 'attempt')}, {duration(figures.duration_s)} in all"
     unobserved: list[str] = []
     if outcome.unobserved_s:
-        away = f"{duration(outcome.unobserved_s)} of the upgrade, while the adapter was away"
-        advice = "if another tool may have written to the device then, flash it again"
+        away = f"{duration(outcome.unobserved_s)}, the adapter was away or this computer suspended"
+        advice = "if another tool sent or another unit was connected then, flash it again"
         unobserved = [f"unobserved:   {away}; {advice}"]
     return [
         f"transferred:  {sent}, {duration(transfer_s)}{_rate(plan, transfer_s)}",
