@@ -29,15 +29,18 @@ class Tab:
     wrong: list[str] = field(default_factory=list)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def browser() -> Iterator[Browser]:
+    """Closed before tests of other folders: Playwright's loop counts as running in this thread
+    until then, and `asyncio.run` fails.
+    """
     from tests.web.browser import chromium  # noqa: PLC0415  needs Playwright
 
     with chromium() as started:
         yield started
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def only_tab(browser: Browser) -> Iterator[Tab]:
     context = browser.new_context(locale="en")
     tab = Tab(context.new_page())
