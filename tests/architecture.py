@@ -21,7 +21,7 @@ _EVERYWHERE: Final = frozenset({
     "documents", "errors", "events", "wording", "log", "files", "validation", "history",
     "python_can",
 })  # fmt: skip
-"""Small modules that many import: they would hide the drawing behind arrows."""
+"""Small modules that many import: their arrows would hide the drawing."""
 
 
 @cache

@@ -92,7 +92,7 @@ def before_an_upgrade(page: Page, album: Album) -> None:
     album.take("dropped")
     page.click(f"#adapter button:text-is('{BikeFault.OFF.value}')")
     expect(page.locator("#trouble .what")).to_be_visible()
-    album.take("nobody")
+    album.take("no-one")
     _again(page)
     _use(page, BikeFault.HARDWARE)
     page.click("#answers-all")

@@ -1,6 +1,6 @@
 """Brings the catalogues of the pages up to date with what the code says:
 `python -m tests.catalogue`. A new sentence is added without a translation, and the test fails until
-it has one; a sentence that nobody says any more is dropped.
+it has one; a sentence that is not used any more is dropped.
 """
 
 from __future__ import annotations

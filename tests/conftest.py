@@ -1,4 +1,4 @@
-"""What holds for every test: what it leaves, it leaves where nobody has to clear it away."""
+"""Fixtures and hooks of all tests: files in temporary folders, lanes, no waits for the disk."""
 
 from __future__ import annotations
 

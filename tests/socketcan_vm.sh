@@ -10,7 +10,7 @@
 #
 #   --sja1000 NAME,NAME     two SJA1000 controllers on one bus, for example of QEMU:
 #                           -object can-bus,id=b -device kvaser_pci,canbus=b -device kvaser_pci,canbus=b
-#   --candlelight PROGRAM   a program that stands for two candleLight adapters on one bus, through the
+#   --candlelight PROGRAM   a program that emulates two candleLight adapters on one bus, through the
 #                           kernel's own driver (modules vhci-hcd and gs_usb): `PROGRAM FIFO` makes two
 #                           interfaces appear, whose USB serial numbers end with 0 and 1, and reads
 #                           lines from the named pipe: `unplug N`, `plug N`, `short MS` (every frame

@@ -150,7 +150,9 @@ def as_binary(data: bytes, _step: int) -> bytes:
     return data
 
 
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="no peak of memory is told")
+@pytest.mark.skipif(
+    not Path("/proc/self/status").exists(), reason="the system reports no peak of memory"
+)
 @pytest.mark.parametrize(
     ("make", "step"), [(as_hex, 32), (as_s_records, 32), (as_elf, 0), (as_binary, 0)]
 )

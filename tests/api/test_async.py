@@ -454,7 +454,7 @@ def test_a_write_that_was_begun_is_read_back_before_its_task_ends() -> None:
 def test_a_loop_that_is_left_alone_ends_the_call(
     closes: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without asyncio.run, nobody cancels what is left: the thread would wait for ever."""
+    """Without asyncio.run, nothing cancels what is left: the thread would wait for ever."""
     monkeypatch.setattr(api, "_LOOP_GONE_S", 0.01)
     with flasher.connect_mock("bms", speed=0) as connection:
         loop = asyncio.new_event_loop()

@@ -208,7 +208,7 @@ def simulated(
 
 
 def lose_complete(frame: Frame, _now: float) -> list[Frame]:
-    """Nobody hears the device's final answer."""
+    """The device's final answer is lost."""
     return [] if frame.data[4:6] == bytes.fromhex("C502") else [frame]
 
 

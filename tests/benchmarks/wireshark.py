@@ -58,7 +58,7 @@ def main() -> None:
             ("with it, every field (-V)", (*loaded, "-V")),
         ):
             before_s = _cpu_s()
-            with (folder / "said").open("wb") as reported:
+            with (folder / "output").open("wb") as reported:
                 subprocess.run(
                     ("tshark", "-r", str(capture), *options), stdout=reported, check=True,
                     stderr=subprocess.DEVNULL, env={**os.environ, "HOME": named},

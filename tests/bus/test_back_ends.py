@@ -44,7 +44,7 @@ GOOD = Frame(0x725, b"\x01")
 
 
 class Foreign(Exception):  # noqa: N818  as a vendor may call it
-    """Stands for the exceptions of libraries that are not installed here."""
+    """Replaces the exceptions of libraries that are not installed here."""
 
     def __init__(self, text: str, error_code: int | None = None) -> None:
         super().__init__(text)
@@ -551,7 +551,7 @@ def test_a_back_end_that_returns_nothing_without_waiting_has_lost_its_adapter(
 def test_a_back_end_that_waits_or_is_none_of_these_is_only_silent(
     bus: FakeBus, monkeypatch: pytest.MonkeyPatch, interface: str, waits_s: float
 ) -> None:
-    """seeedstudio waits as long as its port, whatever it is told."""
+    """seeedstudio waits as long as its port does, whatever the timeout."""
     now = [0.0]
 
     def wait(_timeout: float | None) -> tuple[None, bool]:

@@ -14,7 +14,7 @@ import pytest
 from flasher.bus import detect
 from flasher.bus.detect import DetectedAdapter, Detection, network_adapters, serial_ports
 
-# Stands for the process that asks: the answer of each back end goes by its name.
+# Replaces the process that asks: the answer of each back end goes by its name.
 CHILD = """
 import os, sys, time
 for name in sys.argv[1:]:

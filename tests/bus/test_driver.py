@@ -144,7 +144,7 @@ def test_everything_that_waits_is_received_before_a_due_tick(
 
 
 def test_a_stall_after_the_last_poll_does_not_make_a_tick_late(clock: VirtualClock) -> None:
-    """What comes while the computer stands still is heard before a timer that ran out then."""
+    """Frames that come while the computer stalls are received before a timer that expired then."""
 
     class StallingLink(FakeLink):
         def receive(self, deadline: float) -> Frame | None:

@@ -135,7 +135,7 @@ def test_a_queue_that_stays_full_is_evidence_too() -> None:
 
 
 def test_silence_alone_proves_nothing() -> None:
-    """A device that is off, behind an adapter that reports nothing, or on vcan."""
+    """A device that is off, on an adapter that reports nothing, or on vcan."""
     health = keeper(sent=2).health()
     assert not health.not_acknowledged
     assert health.error() is None

@@ -1,4 +1,4 @@
-"""Who has an adapter: one tool at a time, whoever names the adapter, and nobody who is dead."""
+"""Adapter locks: one tool at a time, by any name of the adapter; a dead process has no lock."""
 
 from __future__ import annotations
 

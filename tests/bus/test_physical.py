@@ -60,7 +60,7 @@ def kernel(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str, kind: str
         ("can3", "vcan", False),  # renamed
         ("slcan0", "slcan", True),
         ("can4", "", True),
-        ("vcan2", None, True),  # there is no `ip`: nobody knows
+        ("vcan2", None, True),  # there is no `ip`: unknown
     ],
 )
 def test_the_kernel_reports_what_a_network_interface_is(

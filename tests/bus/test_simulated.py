@@ -53,7 +53,7 @@ class Talker:
         self.outbox.popleft()
 
     def cancel(self, now: float) -> None:
-        raise AssertionError("a bus cancels nobody")
+        raise AssertionError("a bus cancels no engine")
 
     def take_events(self) -> list[object]:
         taken, self.reports = self.reports, []

@@ -130,7 +130,7 @@ def test_a_controller_that_restarts_by_itself_takes_part_again() -> None:
     assert world.link.health().state is ControllerState.ACTIVE
 
 
-# -- nobody acknowledges --------------------------------------------------------------------------
+# -- no node acknowledges -------------------------------------------------------------------------
 
 
 def test_without_acknowledgement_nothing_leaves_and_linux_reports_error_passive() -> None:

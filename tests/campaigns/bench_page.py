@@ -1,7 +1,7 @@
 """The bench page in a real browser, with a device in another process on a bus of UDP multicast:
 `python -m tests.campaigns.bench_page`, `--case WORDS` for some of the cases.
 
-Each case is a `flasher ui` of its own. It prints what the page said, and what does not hold.
+Each case is a `flasher ui` of its own. It prints what the page showed, and what was wrong.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class Bench:
         return found
 
     def error(self) -> str:
-        """What stands at the end in bold."""
+        """The error at the end, in bold."""
         text = self.page.locator("#result .what").inner_text()
         self.say(text)
         return text
@@ -176,7 +176,7 @@ def refused(bench: Bench) -> None:
         bench.begin()
         bench.go()
         assert bench.claims() == ["YES", "NO", "NOT KNOWN"], "transferred alone"
-        assert "refused the image" in bench.error(), "said to be refused"
+        assert "refused the image" in bench.error(), "the refusal is shown"
         bench.page.click("#do-rescue-it")
         expect(bench.page.locator("#image-1")).to_be_visible()
         assert not _is_shown(bench, "#go"), "the refused image is not chosen again"
@@ -299,7 +299,7 @@ def plugged_again(bench: Bench) -> None:
 
 
 def absent(bench: Bench) -> None:
-    """Nobody is there: it is said, and a trace still tells its story."""
+    """No device is there: the page reports it, and still explains a trace."""
     bench.page.click("#adapter-1:enabled")
     expect(bench.page.locator("#trouble .what")).to_be_visible(timeout=_WAIT_MS)
     bench.say(bench.page.locator("#trouble .what").inner_text())
@@ -337,7 +337,7 @@ def benched(browser: Browser, case: Callable[[Bench], None]) -> Iterator[Bench]:
 
 
 def run(browser: Browser, case: Callable[[Bench], None]) -> tuple[list[str], str]:
-    """What the page said in a case, and what does not hold; "" is nothing."""
+    """What the page showed in a case, and what was wrong; "" is nothing."""
     with benched(browser, case) as bench:
         try:
             case(bench)

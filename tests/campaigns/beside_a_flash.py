@@ -32,7 +32,7 @@ COMMANDS: Final = {
     "doctor": ("doctor", "--listen", "0.2"),
 }
 _EXPECTED: Final = frozenset({ExitCode.OK, ExitCode.BUS, ExitCode.NO_ANSWER})
-"""Of the commands beside a flash, and just behind its end."""
+"""Exit codes of the commands during a flash, and just after its end."""
 ASKS_EVERY_S: Final = 0.2
 """As the documents let a tool repeat a command (4.3)."""
 

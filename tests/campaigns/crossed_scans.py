@@ -43,7 +43,7 @@ _LIMIT_S: Final = 90.0
 _QUIET_S: Final = 2.5
 """After so long without a run no other one begins by itself."""
 _KNOWN_S: Final = 1.5
-"""A unit that was put in so long ago has said who it is."""
+"""A unit that was put in so long ago has identified itself."""
 _GONE_S: Final = 3.0
 """A unit that was pulled so long ago is noticed to be gone."""
 _JUST_S: Final = 1.0
@@ -154,7 +154,7 @@ class Line:
     _pulled_in: dict[str, str] = field(default_factory=dict)
     """The state of each unit when it was pulled out first."""
     _unheard: set[Plan] = field(default_factory=set)
-    """Trials whose unit was pulled in a moment in which nobody can detect that."""
+    """Trials whose unit was pulled at a moment at which that is undetectable."""
     _count: int = 0
 
     def __post_init__(self) -> None:
@@ -407,7 +407,7 @@ class _Trial:
                 line._put(label, socket)
         if self.plan.scenario is not Scenario.ARRIVAL:
             are_there = lambda: all(line._states[each][0] == "scan" for each in self.sockets)  # noqa: E731
-            line._await(are_there, "the units are heard", _ANSWER_S)
+            line._await(are_there, "the units are detected", _ANSWER_S)
             line._pump(_KNOWN_S)
 
     def cross(self) -> None:

@@ -1,5 +1,5 @@
 """Builds the example bootloader for a Cortex-M3, and flashes and tests it on QEMU, over slcan:
-`python -m tests.campaigns.emulated_bootloader`. Options behind it go to `flasher conformance`, as
+`python -m tests.campaigns.emulated_bootloader`. Further options go to `flasher conformance`, as
 `--case RS-01`; by default the quick cases are run, which takes about a minute and a half.
 
 QEMU's monitor is the bench: it switches the power and reads the memory back. The processor's clock

@@ -87,7 +87,7 @@ def run_rows(rows: Sequence[Row], folder: Path) -> list[str]:
         code, out, err, seconds, megabytes = result
         faults = [
             f"exit code {code}" if code != row.code else "",
-            f"does not say {row.reported!r}" if row.reported not in out + err else "",
+            f"does not print {row.reported!r}" if row.reported not in out + err else "",
             f"{err.count('error: ')} messages" if err.count("error: ") != bool(code) else "",
             f"{seconds:.1f} s" if seconds > ROW_LIMIT_S else "",
             f"{megabytes:.0f} MB" if megabytes > ROW_LIMIT_MB else "",

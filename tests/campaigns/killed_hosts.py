@@ -2,7 +2,7 @@
 `python -m tests.campaigns.killed_hosts --runs 100`.
 
 Host and device are two processes on udp_multicast. The device is the one that is hardest to get
-back: its session never ends, and it ignores a reset meanwhile. Nobody switches it off and on: one
+back: its session never ends, and it ignores a reset meanwhile. It is not switched off and on: one
 process is the device of all runs. In every fourth run the command that is given again is killed as
 well. A seed gives the same moments each time.
 """
@@ -151,7 +151,7 @@ def main() -> int:
     parser.add_argument(
         "--impatient", action="store_true", help="with a profile of short limits: ten times faster"
     )
-    parser.add_argument("--verbose", action="store_true", help="show what the last process said")
+    parser.add_argument("--verbose", action="store_true", help="show the last process's output")
     options = parser.parse_args()
     bus = bus_words(free_port())
     trials: list[Trial] = []

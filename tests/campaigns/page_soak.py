@@ -1,6 +1,6 @@
 """A browser on the page of a station at full speed: `python -m tests.campaigns.page_soak --units
-3000`. Tells the memory of page and server as it goes, and every state that the station told and the
-page did not show.
+3000`. Prints the memory of page and server as it goes, and every state that the station reported
+and the page did not show.
 """
 
 from __future__ import annotations
@@ -101,11 +101,13 @@ def main() -> int:
     count = sum(map(len, noted.values()))
     missed = 0
     for socket, states in noted.items():
-        first = states.index(shown[socket][0]) if shown[socket] else 0  # told before it was opened
+        first = (
+            states.index(shown[socket][0]) if shown[socket] else 0
+        )  # reported before it was opened
         same = difflib.SequenceMatcher(None, states[first:], shown[socket], autojunk=False)
         missed += len(states[first:]) - sum(block.size for block in same.get_matching_blocks())
     if missed:
-        sys.stdout.write(f"told {dict(noted)}\nshown {dict(shown)}\n")
+        sys.stdout.write(f"reported {dict(noted)}\nshown {dict(shown)}\n")
     sys.stdout.write(f"{count} states of {options.units} units, {missed} not shown\n")
     return 1 if missed else 0
 

@@ -107,14 +107,14 @@ class Unit(ScriptedDevice):
     @property
     def is_unheard(self) -> bool:
         """It has sent nothing since it got power, or since it confirmed a reset: the announcement
-        of another unit cannot be told from its own then.
+        of another unit looks like its own then.
         """
         reported: list[str] = []
         for entry in reversed(self.log):
             if entry.what in ("power", "reset"):
                 wanted = ["feedback"] if entry.what == "reset" else []
                 return reported == wanted and not self._sent_frames
-            reported += [entry.what] if entry.kind == "said" else []
+            reported += [entry.what] if entry.kind == "sent" else []
         return False
 
     def power_off(self) -> None:

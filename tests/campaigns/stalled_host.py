@@ -1,7 +1,7 @@
 """Flashes 250 kB in a process that is stopped at random moments, and between busy processes:
 `python -m tests.campaigns.stalled_host --stopped 60 --busy 20 --seed 1`.
 
-Host and device model are two processes on a multicast bus. SIGSTOP stands for everything that takes
+Host and device model are two processes on a multicast bus. SIGSTOP represents all that takes
 the computer away: swap, a lid that is closed, a busy station. Each flash has to end with exit code
 0 and the image in the device.
 """

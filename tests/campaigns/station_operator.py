@@ -37,9 +37,9 @@ _ANSWER_S: Final = 10.0
 _TURN_S: Final = 0.02
 _AT_WORK: Final = ("running", "saving")
 _LEFT_S: Final = 8.0
-"""A socket that shows a unit for so long which is not in it has to be told."""
+"""After so long, a socket that shows a unit which is not in it needs a scan."""
 _KNOWN_S: Final = 6.0
-"""A unit that was put in is heard sooner."""
+"""A unit that was put in is detected sooner."""
 _JUST_S: Final = 1.0
 """What was done so short a time ago may have crossed what the station shows."""
 _GAPS_S: Final = (0.0, 0.3, 0.8)
@@ -284,7 +284,7 @@ class Operator:
                 self._take_of(self.places[event["socket"]], event)
 
     def _take_of(self, place: Place, event: dict[str, Any]) -> None:
-        """What is said of one socket."""
+        """What the station shows of one socket."""
         match event["event"]:
             case "SocketChanged":
                 place.state, place.serial = event["state"], event["serial"]
@@ -526,7 +526,7 @@ class Operator:
                 self.units.out(label)
                 place = self._named(place)
                 self._put(label, place)
-                self.counts["unit moved, as the station said"] += 1
+                self.counts["unit moved, as the station asked"] += 1
         if self._answer == "accepted":
             self._see_run(place.unit, place, over)
         elif free := _FREE.search(" ".join(self._reported)):

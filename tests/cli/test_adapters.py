@@ -34,7 +34,7 @@ UP = Interface(
 
 @dataclass
 class Machine:
-    """A computer: what is plugged in, and the bus behind each adapter that is opened."""
+    """A computer: what is plugged in, and the bus of each adapter that is opened."""
 
     detected: DetectionResult = field(default_factory=DetectionResult)
     ports: list[DetectedAdapter] | None = field(default_factory=list)

@@ -22,7 +22,7 @@ AREA = "[bms.application_area]\nstart = 0x1000\nsize_bytes = 0x210\n"
 
 @pytest.fixture
 def battery(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Battery:
-    """What stands on the bus in place of the device model; the working directory is empty."""
+    """What is on the bus in place of the device model; the working directory is empty."""
     battery = Battery()
     monkeypatch.setattr("flasher.api.connect_mock", lambda *_, **__: opened(battery))
     monkeypatch.chdir(tmp_path)

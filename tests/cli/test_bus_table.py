@@ -49,7 +49,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def opened(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """What python-can is asked to open; a silent bus is behind all of it."""
+    """What python-can is asked to open, always a silent bus."""
     seen: list[dict[str, Any]] = []
 
     def bus(**config: Any) -> can.BusABC:

@@ -28,7 +28,7 @@ Complete = Callable[[str], set[str]]
 
 @pytest.fixture
 def complete(monkeypatch: pytest.MonkeyPatch) -> Complete:
-    """What is offered behind the words so far; "FILES" where the shell offers files by itself."""
+    """What is offered after the words so far; "FILES" where the shell offers files by itself."""
     monkeypatch.setattr("flasher.cli.values._NETWORK", Path("no-such-folder"))
 
     def offered(line: str) -> set[str]:
@@ -158,7 +158,7 @@ def test_a_shell_learns_how_to_ask(
 
 
 def examples_of(command: click.Command) -> list[list[str]]:
-    """The words of every example; the remark behind it, and what it is piped into, left out."""
+    """The words of every example; its remark, and what it is piped into, left out."""
     found = []
     for line in re.sub(r"\s*\\\n\s*", " ", command.epilog or "").splitlines():
         if line.startswith("  flasher "):

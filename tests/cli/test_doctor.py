@@ -517,7 +517,7 @@ def test_wrong_usage_is_exit_2(examine: Doctor) -> None:
     assert examine("-i", "udp_multicast", "-c", "x", "--bus-kwargs", "port=x").code == 2
 
 
-# -- how it is said -------------------------------------------------------------------------------
+# -- output ---------------------------------------------------------------------------------------
 
 
 def test_a_line_a_finding_with_its_commands_below() -> None:

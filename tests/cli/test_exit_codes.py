@@ -176,7 +176,7 @@ def lose_complete(frame: Frame, _now: float) -> list[Frame]:
 
 
 def silent_since_the_end(scene: Scene) -> Words:
-    """Nothing that the device says at its end and behind it arrives."""
+    """Nothing that the device sends from its end on arrives."""
     stage = scene.stage
     is_over = False
 
@@ -259,7 +259,7 @@ CASES = [
     Case("bus-off", ExitCode.BUS, bus_off, "transferring", "bus-off", "bit rate"),
     Case("bus-off at once", ExitCode.BUS, bus_off_from_the_beginning,
          "before anything was sent; the simulated bus", "bus-off", "bit rate"),
-    Case("nobody acknowledges", ExitCode.BUS, alone,
+    Case("no node acknowledges", ExitCode.BUS, alone,
          "boot version; the simulated bus", "termination", "Check power"),
     Case("bus taken", ExitCode.BUS, blocked, "resetting", "whole bus", "State of"),
     Case("queue full", ExitCode.BUS, refused_by_the_driver, "packet 3 of 4", "no room", "Look."),

@@ -15,7 +15,7 @@ from tests.trace.tape import Tape
 
 @pytest.fixture
 def trace(tmp_path: Path) -> Path:
-    """An upgrade with a NAK, a damaged packet and a packet that nobody answered."""
+    """An upgrade with a NAK, a damaged packet and an unanswered packet."""
     tape = Tape().to_packet(4).damaged_packet(4).nak(4).packet(4).wait(0.6)
     return tape.packet(4).ack(4).packets(5, 10).end().complete().save(tmp_path / "trace.blf")
 

@@ -137,7 +137,7 @@ def test_the_trace_holds_every_frame_in_both_directions(
         messages = list(reader)
     ids = [message.arbitration_id for message in messages]
     assert set(ids) == {0x753, 0x735}
-    # One more boot version than the plan has, at the most: the burst goes on while it is answered.
+    # At most one more boot version than the plan has: the burst goes on while it is answered.
     assert len(ids) >= run.document["plan"]["frames"]
     times = [message.timestamp for message in messages]
     assert times == sorted(times)

@@ -92,7 +92,7 @@ def bench(flasher: Flasher, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
 
 
 def wrote(stage: Stage) -> bool:
-    """Whether the device was told to erase anything."""
+    """Whether the device received an update command, which erases."""
     return any(frame.data.startswith(UPDATE) for frame in stage.heard)
 
 
@@ -153,7 +153,7 @@ def test_a_right_manifest_lets_every_check_pass_and_the_result_names_it(bench: W
 def test_a_rule_that_cannot_be_checked_refuses_as_one_that_fails(
     bench: Workbench, rule: dict[str, Any]
 ) -> None:
-    """The device sits in its bootloader: nobody can ask it."""
+    """The device is in its bootloader, which answers no query."""
     stage = Stage(has_application=False)
     run = bench.flash(stage, manifest=rule)
     assert run.code == ExitCode.WRONG_DEVICE

@@ -1,4 +1,4 @@
-"""`flasher help`: each code that is printed is told, and has the digits of its exit code."""
+"""`flasher help`: it explains each printed code, whose digits begin with its exit code."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_a_code_is_printed_and_explained(flasher: Flasher) -> None:
 
 @pytest.mark.parametrize("code", ["E202", "E503", "E504"])
 def test_a_code_does_not_claim_that_nothing_was_done(flasher: Flasher, code: str) -> None:
-    """Each is the error of a first attempt, and of a later one behind an erased application."""
+    """Each is the error of a first attempt, and of a later one after an erased application."""
     reported = flasher("help", code).out.lower()
     for claim in ("nothing was", "nothing has", "is still there"):
         assert claim not in reported

@@ -177,7 +177,7 @@ def test_v_shows_the_log_tersely(
         say_something()
     assert capsys.readouterr().err.splitlines() == shown
     say_something()
-    assert capsys.readouterr().err == "", "nothing is left behind"
+    assert capsys.readouterr().err == "", "no file is left"
 
 
 def test_the_file_gets_flashers_details_but_not_those_of_python_can(

@@ -1,4 +1,4 @@
-"""The entry point: help, version, and output that nobody reads any more."""
+"""The entry point: help, version, and output without a reader."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_one_is_singular() -> None:
     assert counted(1200, "packet") == "1,200 packets"
 
 
-# -- output that nobody reads ---------------------------------------------------------------------
+# -- output without a reader ----------------------------------------------------------------------
 
 
 @contextlib.contextmanager

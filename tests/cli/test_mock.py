@@ -94,7 +94,7 @@ class Host:
             connection.device().upgrade(plan, verify=api.Level.NONE)
 
     def hear(self, question: bytes, can_id: int, wanted: bytes) -> bytes:
-        """Send the frames of a message, or listen only, until `wanted` was heard on `can_id`."""
+        """Send the frames of a message, or listen only, until `wanted` was received on `can_id`."""
         heard = b""
         with can.Bus(interface="virtual", channel=self.channel, ignore_config=True) as bus:
             for start in range(0, len(question), 8):
@@ -102,7 +102,7 @@ class Host:
                 bus.send(can.Message(arbitration_id=0x752, data=data, is_extended_id=False))
             while wanted not in heard:
                 message = bus.recv(5.0)
-                assert message is not None, f"only heard {heard.hex(' ')}"
+                assert message is not None, f"received only {heard.hex(' ')}"
                 if message.arbitration_id == can_id:
                     heard += bytes(message.data)
         return heard
@@ -129,7 +129,7 @@ def host(monkeypatch: pytest.MonkeyPatch) -> Iterator[Host]:
     def has_ended(tool: mock_command._Tool, now: float) -> bool:
         return (beside.ends_the_mock and beside.has_done.is_set()) or is_quiet(tool, now)
 
-    # So that the mock sees sooner that it may end, and nobody listens for a second tool.
+    # So that the mock sees sooner that it may end, and does not listen for a second tool.
     monkeypatch.setattr(mock_command._Tool, "is_quiet", has_ended)
     monkeypatch.setattr(mock_command, "_QUIET_S", 0.3)
     monkeypatch.setattr("flasher.driver.MAX_WAIT_S", 0.02)

@@ -264,7 +264,7 @@ def test_a_terminal_that_goes_away_does_not_end_the_upgrade(
     monkeypatch.setattr("sys.stderr", Gone())
     output = Output()
     show(output, events.PhaseEntered(Phase.TRANSFER, 1), *acknowledged(1, 2, 8))
-    output.error_line("nobody reads this")
+    output.error_line("this has no reader")
 
 
 def test_away_from_a_terminal_there_is_one_line_a_phase_and_no_carriage_return(

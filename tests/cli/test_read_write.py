@@ -19,7 +19,7 @@ MOCK = ("--mock", "--mock-speed", "0")
 
 @pytest.fixture
 def battery(monkeypatch: pytest.MonkeyPatch) -> Battery:
-    """What stands on the bus in place of the device model."""
+    """What is on the bus in place of the device model."""
     battery = Battery()
     monkeypatch.setattr("flasher.api.connect_mock", lambda *_, **__: opened(battery))
     return battery

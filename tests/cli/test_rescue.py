@@ -22,7 +22,7 @@ from tests.end_to_end.stage import IMAGE, SMALL, Stage
 
 
 def repair_named_in(reported: str) -> list[str]:
-    """The words of the command on the line behind "to repair it:", as a shell parts them."""
+    """The words of the command on the line after "to repair it:", split like a shell does."""
     lines = reported.splitlines()
     words = shlex.split(lines[lines.index("  to repair it:") + 1])
     assert words[:1] == ["flasher"]

@@ -146,7 +146,7 @@ def _press_ctrl_c(_address: str) -> bool:
 @pytest.fixture
 def files(flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: Any) -> None:
     """The files that some of the command lines name, in the working directory; a mock that sees
-    one event of each kind and ends; a browser that nobody looks at, and who ends its page.
+    one event of each kind and ends; no browser, and Ctrl-C in its place.
     """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("webbrowser.open", _press_ctrl_c)

@@ -51,7 +51,7 @@ FAST = ("--mock-speed", "0", "--mock-dead", "0", "--mock-slow", "0")
 
 @pytest.fixture(autouse=True)
 def threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No processes, and nobody at a keyboard."""
+    """No processes, and no keyboard."""
     monkeypatch.setattr("flasher.cli.station.run.LAUNCH", ThreadPort)
     monkeypatch.setattr(sys, "stdin", io.StringIO())
 
@@ -65,7 +65,7 @@ def recipe(tmp_path: Path) -> Path:
 
 
 def lines_of(run: Run) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """The events, and the document behind them."""
+    """The events, and the document after them."""
     *lines, document = [json.loads(line) for line in run.out.splitlines()]
     return lines, document
 
@@ -290,7 +290,7 @@ def test_a_label_that_waits_when_the_pipe_has_ended_is_dropped(
     monkeypatch.setattr("flasher.station.presence.SILENCE_S", 0.1)
     monkeypatch.setattr(sys, "stdin", io.StringIO("SOCKET A\nW2605002\n"))
     sockets = tmp_path / "sockets.toml"
-    bus = 'interface = "virtual"\nchannel = "nobody connects a unit"\n'
+    bus = 'interface = "virtual"\nchannel = "no unit is connected"\n'
     sockets.write_text(f'[[socket]]\nname = "A"\n{bus}', "utf-8")
     words = ("--recipe", recipe, "--sockets", sockets, "--database", tmp_path / "r.sqlite")
     began = time.perf_counter()

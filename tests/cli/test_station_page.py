@@ -47,7 +47,7 @@ RUN = ("station", "run", "--recipe", RECIPE, "--mock-sockets", "2", "--mock-spee
 
 @pytest.fixture(autouse=True)
 def threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No processes, and nobody at a keyboard."""
+    """No processes, and no keyboard."""
     monkeypatch.setattr("flasher.cli.station.run.LAUNCH", ThreadPort)
     monkeypatch.setattr(sys, "stdin", io.StringIO())
 
@@ -62,7 +62,7 @@ def password(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def resumed(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    """Somebody at the page scans RESUME once the line is stopped; what the page said by then."""
+    """The page scans RESUME once the line is stopped; what the page showed by then."""
     reasons: list[str] = []
     threads: list[threading.Thread] = []
 
@@ -98,7 +98,7 @@ def resumed(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
 
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Any]]:
-    """What the page and its stream said while the station ran."""
+    """What the page and its stream showed while the station ran."""
     found: list[Any] = []
     threads: list[threading.Thread] = []
 
@@ -149,7 +149,7 @@ def test_the_page_shows_what_the_station_does(flasher: Flasher, asked: list[Any]
 def test_a_stopped_line_waits_for_the_people_at_its_page(
     flasher: Flasher, resumed: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Though nobody is at a keyboard."""
+    """Though there is no keyboard."""
     finish, failures = Store.finish, [DiskFullError("The disk is full.", remedy="Make room.")]
 
     def finish_or_fail(*given: Any, **named: Any) -> Any:

@@ -24,7 +24,7 @@ NOTHING_STATED = ConformanceProfile()
 
 
 class DeafDevice(MockDevice):
-    """Ignores all frames once told to hang; with `hangs_for_good` even after a power cycle."""
+    """Ignores all frames once `hangs`; with `hangs_for_good` even after a power cycle."""
 
     hangs = False
     hangs_for_good = False

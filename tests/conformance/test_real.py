@@ -160,7 +160,7 @@ def test_what_a_link_cannot_send_is_unsupported() -> None:
 
 @pytest.mark.parametrize(("on", "reported"), [(True, "on"), (False, "off")])
 def test_the_power_command_gets_on_or_off(tmp_path: Path, on: bool, reported: str) -> None:
-    path = tmp_path / "said"
+    path = tmp_path / "power"
     DevicePowerCommand(f'{sys.executable} -c "{SCRIPT}" {path} {{on|off}}')(on)
     assert path.read_text() == reported
 

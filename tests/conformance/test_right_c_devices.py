@@ -49,7 +49,7 @@ def test_a_seed_makes_the_same_device_again() -> None:
         (1, "FR-01"),  # an update command in the burst is processed after it
         (6, "FR-07"),
         (3, "RS-02"),  # a burst of one
-        (3, "TX-13"),  # whose restart is over when request transfer may have left versions behind
+        (3, "TX-13"),  # its restart ends when request transfer may follow versions
         (8, "TX-01"),
         (4, "TX-13"),  # deaf in a burst of two
         (21, "EN-07"),  # it takes longer to announce itself than the reset is repeated

@@ -220,7 +220,7 @@ def test_a_nak_after_all_packets_may_name_any_number(step: str) -> None:
     assert explorer.replay(walk).finding is None
 
 
-# -- heard -----------------------------------------------------------------------------------------
+# -- reception ------------------------------------------------------------------------------------
 
 
 class _RecordLast(MockDevice):

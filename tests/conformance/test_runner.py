@@ -521,7 +521,7 @@ def _stand_still(bench: Bench, for_s: float) -> None:
 
 
 class _Stalls:
-    """A case that sends packet 1, and stands still for 0.3 s in it in its first `times` runs."""
+    """A case that sends packet 1, and stalls for 0.3 s in it in its first `times` runs."""
 
     def __init__(self, times: int) -> None:
         self.runs = 0

@@ -364,13 +364,13 @@ def test_a_program_of_another_version_of_the_header_is_refused(tmp_path: Path) -
 
 _OF_ABI_1 = """
 import os, struct, sys
-def told(kind, data):
+def send(kind, data):
     os.write(1, struct.pack("<B3xI", ord(kind), len(data)) + data)
-told("f", struct.pack("<9I", 1, 4096, 1024, 8, 0, 2048, 100, 10, 3))
+send("f", struct.pack("<9I", 1, 4096, 1024, 8, 0, 2048, 100, 10, 3))
 os.read(0, 8 + 12)
-told("e", struct.pack("<QI", 5, 0))
+send("e", struct.pack("<QI", 5, 0))
 answer = os.read(0, 64)
-told("l", repr(struct.unpack("<B3xIQ", answer)).encode())
+send("l", repr(struct.unpack("<B3xIQ", answer)).encode())
 os._exit(4)
 """
 

@@ -60,7 +60,7 @@ def faults(text: str) -> list[str]:
     adapter, sample = ADAPTER.search(text), SAMPLE.search(text)
     found = [f"{sample[0]} beside {adapter[0]}"] if adapter and sample else []
     found += [
-        f"not said to be virtual: {line.strip()}"
+        f"not marked as virtual:  {line.strip()}"
         for line in text.replace("\\\n", " ").splitlines()
         if FLASHES.search(line) and SAMPLE.search(line) and not VIRTUAL.search(line)
     ]

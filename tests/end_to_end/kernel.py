@@ -1,6 +1,6 @@
 """Adapters with drivers of the kernel in the guest of `tests/socketcan_vm.sh`, and root's commands.
 
-`FLASHER_CANDLELIGHT` is the control file of the program that stands for two candleLight adapters on
+`FLASHER_CANDLELIGHT` is the control file of the program that emulates two candleLight adapters on
 one bus, `FLASHER_SJA1000` the names of two SJA1000 controllers on another one. Neither is ever
 looked for: what a computer has plugged in is no affair of tests.
 """
@@ -108,7 +108,7 @@ class Candlelights(Pair):
             self.plug(number)
 
     def order(self, words: str) -> None:
-        """A line for the program that stands for the adapters."""
+        """A line for the program that emulates the adapters."""
         Path(_CONTROL).write_text(f"{words}\n", encoding="ascii")
         time.sleep(0.02)  # it reads one line at a time
 

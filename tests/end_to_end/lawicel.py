@@ -72,7 +72,7 @@ class Program:
                 yield (letter if self.confirms_frames else b"") + OK, self._on_bus(frame)
 
     def line_of(self, frame: Frame) -> bytes:
-        """How a frame of the bus is told to the computer; nothing while it is closed."""
+        """A frame of the bus as sent to the computer; nothing while it is closed."""
         if not self.is_open or self._on_bus(frame) is None:
             return b""
         letter = b"r" if frame.is_remote else b"t"
@@ -84,7 +84,7 @@ class Program:
         return letter + can_id + b"%d" % len(frame.data) + data + stamp + b"\r"
 
     def _on_bus(self, frame: Frame) -> Frame | None:
-        """At another bit rate nobody understands it, nor it anybody."""
+        """At another bit rate it neither understands the others nor they it."""
         return frame if self.kbit == self._bus_kbit else None
 
     def _answer(self, line: bytes) -> bytes:
@@ -224,7 +224,7 @@ class Lawicel:
         def run() -> None:
             try:
                 drive(engine, self, MonotonicClock(), cancelled=over.is_set)
-            except BaseException as failure:  # noqa: BLE001  told by who began it
+            except BaseException as failure:  # noqa: BLE001  reported by its caller
                 self.failure = failure
 
         thread = threading.Thread(target=run)

@@ -4,7 +4,7 @@
     stage.at_packet[7] = stage.cut_power
     result = stage.flash(IMAGE)
 
-The clock is virtual: minutes of waiting take no time. `heard` holds what the host put on the wire.
+The clock is virtual: minutes of waiting take no time. `heard` has what the host put on the wire.
 """
 
 from __future__ import annotations

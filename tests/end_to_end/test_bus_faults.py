@@ -62,7 +62,7 @@ def at(index: int, fate: Callable[[Frame], list[Frame]]) -> Callable[[Frame, flo
 
 
 def judge(outcome: Outcome, device: MockDevice) -> None:
-    """Right bytes, or an explicit end: what is never said twice by the device may be missed."""
+    """Right bytes, or an explicit end: what the device sends once may be missed."""
     if outcome.ending is Ending.NO_REQUEST:
         # Request transfer was damaged; the update command is never sent into silence (R2).
         assert device.stored_image is None

@@ -101,7 +101,7 @@ def story(name: str, folder: Path) -> dict[str, Any]:
 
 
 def words_of(printed: dict[str, Any]) -> tuple[object, ...]:
-    """What is said of an upgrade, without its times."""
+    """The description of an upgrade, without its times."""
     upgrade = printed["upgrades"][0]
     return (
         printed["verdict"]["cause"],

@@ -66,13 +66,13 @@ class ServedBattery:
                     connection.clock,
                     cancelled=self._is_over.is_set,
                 )
-        except BaseException as failure:  # noqa: BLE001  told by the test, not by the thread
+        except BaseException as failure:  # noqa: BLE001  reported by the test, not the thread
             self.failure = failure
 
 
 @pytest.fixture
 def battery(flasher: Flasher) -> Iterator[ServedBattery]:  # noqa: ARG001  for what it patches
-    """Behind `flasher`, which takes the machine's configuration of python-can away."""
+    """After `flasher`, which takes the machine's configuration of python-can away."""
     with ServedBattery() as served:
         yield served
 

@@ -40,7 +40,7 @@ request_transfer_timeout_s = 0.5
 """A profile: silence means something sooner."""
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="needs a kill that nobody can catch")
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a kill that cannot be caught")
 def test_a_host_that_is_killed_at_any_packet_is_repaired_by_the_same_command(
     bus: tuple[str, ...],
     tmp_path: Path,
@@ -49,7 +49,7 @@ def test_a_host_that_is_killed_at_any_packet_is_repaired_by_the_same_command(
     kill_and_repair(bus, tmp_path, (PACKETS - 1,))
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="needs a kill that nobody can catch")
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a kill that cannot be caught")
 def test_a_session_that_a_killed_host_left_open_is_finished_by_the_same_command(
     bus: tuple[str, ...],
     tmp_path: Path,

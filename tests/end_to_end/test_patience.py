@@ -15,7 +15,7 @@ AWAY_S = 0.3
 
 
 def without_power(stage: Stage, seconds: float) -> None:
-    """The device is off for so long, and nobody else is there to acknowledge."""
+    """The device is off for so long, and no other node acknowledges."""
     stage.cut_power()
     stage.bus.is_unacknowledged = True
     back_at = stage.clock.now() + seconds

@@ -1,4 +1,4 @@
-"""Every command that flasher prints about an interface of Linux is typed as it stands there, has to
+"""Every command that flasher prints about an interface of Linux is typed as printed, has to
 succeed, and has to help.
 """
 

@@ -224,7 +224,7 @@ _AROUND: Final = {
 
 
 def shown(item: Item) -> list[tuple[str, str]]:
-    """Filter names and values, without what stands around every message."""
+    """Filter names and values, without those of every message."""
     kind = item.one("kind")
     found = []
     flags = {name: codec for row in catalogue.ITEMS for name, codec in row.content.LAYOUT

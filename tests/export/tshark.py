@@ -59,7 +59,7 @@ def write_capture(path: Path, frames: Iterable[tuple[float, Frame]]) -> Path:
 
 
 def run(*words: str | Path, folder: Path) -> str:
-    """What tshark prints, with the dissector loaded and nobody's own settings."""
+    """What tshark prints, with the dissector loaded and no user's settings."""
     script = folder / "welling.lua"
     if not script.exists():
         script.write_text(dissector("0"), encoding="utf-8")

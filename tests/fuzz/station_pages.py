@@ -30,7 +30,7 @@ from tests.web.answering import app_with
 from tests.web.test_login import PEOPLE, PIN
 
 _NOBODY: Final = b"!"
-"""Before a request of a browser in which nobody has signed in."""
+"""Before a request of a browser without a sign-in."""
 _FIELDS: Final = (
     "serial", "part", "lot", "recipe", "from", "to", "search", "outcome", "code", "socket", "by",
     "image", "sha256", "event", "before", "after", "token", "badge", "pin", "password", "number",

@@ -42,7 +42,7 @@ SentRow = TypeVar("SentRow", bound=UpgradeMessage | Message)
 
 
 def image_of(size_bytes: int, seed: int = 1) -> Image:
-    """An image of random bytes behind a vector table, without a version inside."""
+    """An image of random bytes after a vector table, without a version inside."""
     data = VECTORS + random.Random(seed).randbytes(size_bytes)
     return Image.from_bytes(data[:size_bytes])
 
@@ -71,7 +71,7 @@ class Bench:
         self.sent: list[tuple[float, UpgradeMessage | Message]] = []
         """Every message that has left the host, with the time at which its last frame had."""
         self.on_frame: Callable[[int], None] | None = None
-        """Called with the number of frames sent so far, before the engine is told of each."""
+        """Called with the number of frames sent so far, before the engine gets each."""
         self._frames = 0
         self._read = 0
         self._wire = Reassembler(target.request_id, 1.0)

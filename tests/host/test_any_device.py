@@ -112,14 +112,14 @@ def test_one_update_command_at_most_goes_into_silence_and_none_to_an_application
     assert len(commands) <= len(asking) + bench.outcome.sent_into_silence
 
     def unheard(until_s: float) -> list[float]:
-        """The commands before which nothing was said for the erase limit, until so long before."""
+        """The commands before which nothing was sent for the erase limit, until so long before."""
         return [
             at
             for at in commands
             if not any(at - 9.9 < each <= at - until_s for each, _ in reported)
         ]
 
-    leaving_s = 0.0015  # what is said while it leaves does not call it back
+    leaving_s = 0.0015  # what arrives while it leaves does not call it back
     assert len(unheard(0.0)) <= bench.outcome.sent_into_silence <= len(unheard(leaving_s))
     for at in unheard(0.0):
         if at == commands[0]:

@@ -278,7 +278,7 @@ def test_the_silence_is_counted_from_the_last_word_of_the_device() -> None:
     bench = Bench(options=options(3))
     lose_request(bench)
     bench.wait(4.0)
-    bench.say(RequestTransfer())  # too late: it has been told to restart
+    bench.say(RequestTransfer())  # too late: it got a reset
     bench.wait(9.9)
     assert bench.unread == []
     bench.expect(UpdateCommand, within_s=0.2)

@@ -442,7 +442,7 @@ def any_world(seed: int, *, units: int) -> World:
 @pytest.mark.no_cover
 @each("seed", SOME)
 def test_two_units_that_both_show_themselves_are_never_a_success(seed: int) -> None:
-    """What they may hide behind stands in docs/explanation/safety.md."""
+    """What may hide them is in docs/explanation/safety.md."""
     given = any_world(seed, units=2)
     assert not play(given).is_missed, given
 

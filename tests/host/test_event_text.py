@@ -86,8 +86,8 @@ def test_an_event_that_other_means_show_has_no_line(event: object) -> None:
             "The adapter failed: unplugged. Waiting 5 s for the adapter ...",
         ),
         (
-            events.BusBlocked("Nobody acknowledges.", 240.0),
-            "Nobody acknowledges. Trying on for 4 min: check power and contacts of the device.",
+            events.BusBlocked("No node acknowledges.", 240.0),
+            "No node acknowledges. Trying on for 4 min: check power and contacts of the device.",
         ),
         (
             events.SecondToolAwaited("a reset", 2.0),

@@ -17,7 +17,7 @@ OTHER = Frame(0x752, bytes.fromhex("55AA160742055245"))
 
 
 class MarkedGuard(Guard):
-    """A guard behind a link that marks the echoes of what it has sent."""
+    """A guard on a link that marks the echoes of what it has sent."""
 
     def __init__(self, target: Target) -> None:
         super().__init__(target, DEFAULT_TIMINGS)

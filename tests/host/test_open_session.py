@@ -254,7 +254,7 @@ def test_the_default_deadline_leaves_room_for_the_silence() -> None:
 # -- what could not be checked ---------------------------------------------------------------------
 
 UNCHECKED = CheckResult(
-    IdentityCheck.HARDWARE, CheckVerdict.REFUSED, "nobody told its hardware", is_unchecked=True
+    IdentityCheck.HARDWARE, CheckVerdict.REFUSED, "its hardware is unknown", is_unchecked=True
 )
 
 
@@ -282,12 +282,12 @@ def test_a_device_that_announces_itself_after_all_is_refused_by_that_rule(after_
     bench.wait(1.0)
     assert bench.outcome.ending is Ending.UNCHECKED
     assert bench.outcome.waiver == IdentityCheck.HARDWARE.value
-    assert "nobody told its hardware" in bench.outcome.detail
+    assert "its hardware is unknown" in bench.outcome.detail
     assert bench.unread == []
 
 
 def test_a_silent_device_is_not_refused_by_that_rule() -> None:
-    """Nobody is offered to waive what is not the trouble."""
+    """The error offers no waiver of a check that did not fail."""
     bench = unchecked_bench()
     to_silence(bench)
     bench.wait(ERASE_S + 0.1)

@@ -1,4 +1,4 @@
-"""The error that stands for each ending: exit code, error code, where, cause and next step."""
+"""The error of each ending: exit code, error code, where, cause and next step."""
 
 from __future__ import annotations
 

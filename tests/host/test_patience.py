@@ -292,7 +292,7 @@ def test_another_tool_before_the_update_command_ends_it() -> None:
 
 
 def test_another_tool_after_the_end_of_transfer_ends_it() -> None:
-    """The image may be complete: nobody erases it again."""
+    """The image may be complete: it is not erased again."""
     bench = Bench(200, options=UpgradeOptions())
     bench.to_end()
     bench.engine.second_tool(SEEN, bench.now)

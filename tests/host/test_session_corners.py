@@ -1,4 +1,4 @@
-"""What comes when nobody expects it any more: after the end, before the beginning, in between."""
+"""Messages that are not expected any more: after the end, before the beginning, in between."""
 
 from __future__ import annotations
 

@@ -268,7 +268,7 @@ def test_a_frame_that_is_no_payload_is_no_application() -> None:
 def test_one_that_answers_a_question_is_in_no_session(*, answers: bool) -> None:
     dialogue = Dialogue(OPEN, identity=Identity())
     if answers:
-        # On the tool's own id, as a product's own query may be answered: no application is heard.
+        # On the tool's own id, as a product's own query may be answered: no sign of an application.
         dialogue.session._application_ids = frozenset()
         dialogue.identified()
     dialogue.wait(60.0)
@@ -527,7 +527,7 @@ def test_a_question_that_was_cut_short_is_not_gone_on_with() -> None:
     assert session.next_frame(2 * LISTEN_FIRST_S) == first
 
 
-# -- why nobody answered --------------------------------------------------------------------------
+# -- why no device answered -----------------------------------------------------------------------
 
 
 @each(

@@ -68,7 +68,7 @@ def lose_complete_and_what_the_new_application_says(frame: Frame, now: float) ->
 
 
 class Witness:
-    """A tap: what the host handed to its adapter after it had heard the other tool."""
+    """A tap: what the host handed to its adapter after it had received the other tool."""
 
     def __init__(self) -> None:
         self.has_heard = False
@@ -131,7 +131,7 @@ def test_a_second_tool_cuts_a_message_short_that_was_finished_for_a_clean_end() 
 
 @each("target", ["bms", "obc"])
 def test_a_tool_that_flashes_is_detected_before_anything_is_sent(target: str) -> None:
-    """The OBC cannot be asked: before its reset nothing else would have told."""
+    """The OBC cannot be asked: before its reset nothing else would have shown it."""
     stage = Stage(target)
     packet = Frame(stage.target.request_id, bytes.fromhex("0102030405060708"))
     stage.bus.attach(Speaker(packet, every_s=0.09, begins_at=0.08))

@@ -46,7 +46,7 @@ def begins(bench: Bench, kind: type[UpgradeMessage]) -> float:
 
 
 def heard_before(options: UpgradeOptions | None = None) -> Bench:
-    """An upgrade whose device was heard to announce itself while it was asked."""
+    """An upgrade whose device announced itself while it was asked."""
     bench = Bench()
     bench.engine = Upgrade(plan(bench.image, BMS, WELLING.bitrate_bps), options)
     bench.engine._upgrade.announcement = BOOT.to_message(BMS.answer_id)
@@ -155,7 +155,7 @@ def test_announcements_that_go_on_are_those_of_one_bootloader_that_confirms_ever
     assert begins_at == pytest.approx(watched_since + 5.0, abs=0.01)
 
 
-# -- a device that was heard before ---------------------------------------------------------------
+# -- a device that sent before --------------------------------------------------------------------
 
 
 def test_a_device_that_announced_itself_gets_a_reset_that_only_another_application_answers() -> (

@@ -27,7 +27,7 @@ GOOD_LOG = b"(1.0) can0 752#55AA110234007A11\n(1.1) can0 725#55AA0C0455030041\n"
 @dataclass(frozen=True)
 class Row:
     """`make` lays the file `name` into a folder; a command with it in place of FILE has to end with
-    `code` and say `said`, on stderr unless it ends well.
+    `code` and print `reported`, on stderr unless it ends well.
     """
 
     name: str

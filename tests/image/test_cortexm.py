@@ -145,7 +145,7 @@ def test_a_vector_table_at_an_odd_place_is_reported() -> None:
 
 
 def merged(count: int) -> Image:
-    """A boot loader and `count` more programs behind it."""
+    """A boot loader and `count` more programs after it."""
     data = bytearray()
     for index in range(count + 1):
         at = BASE + index * 0x400
@@ -189,7 +189,7 @@ def test_a_vector_that_is_empty_lies_nowhere(nothing: int, base: int | None) -> 
 
 
 def test_of_an_image_that_is_no_program_no_more_is_reported_than_that() -> None:
-    """Neither that its base is odd, nor that another program stands in it, nor how to judge it."""
+    """Neither that its base is odd, nor that it contains another program, nor how to judge it."""
     inner = (STACK, BASE + 0x301, BASE + 0x303, BASE + 0x305)
     words = (0, BASE + 5, *(0,) * 126, *inner)
     for base in (BASE, BASE + 4, None):
@@ -227,7 +227,7 @@ END = BASE + 0x1000
         ((0x201, 0x209, 0x20D), True),
         ((0x1FF, 0x209, 0x20D), False),
         ((0xFFF, 0x209, 0x20D), True),
-        ((0x1001, 0x209, 0x20D), False),  # behind the image
+        ((0x1001, 0x209, 0x20D), False),  # after the image
     ],
 )
 def test_a_second_program_has_all_its_handlers_inside_the_image(

@@ -1,4 +1,4 @@
-"""Loading: formats told apart, options, every refusal, and what a refusal costs."""
+"""Loading: detection of formats, options, every refusal, and what a refusal costs."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def test_the_merged_file_rule_can_be_waived() -> None:
     assert load(BAD / "outside_vector.hex", allow_outside_vector=True).size_bytes == 32
 
 
-# -- what a format is told by -------------------------------------------------------------------
+# -- how a format is detected -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -428,7 +428,7 @@ print(time.process_time() - start, int(re.search(r"VmHWM:\\s*([0-9]+) kB", statu
 
 
 def measure(path: Path) -> tuple[str, float, float]:
-    """What loading and planning said, seconds of processor time, megabytes at the peak.
+    """Output of loading and planning, seconds of processor time, megabytes at the peak.
 
     The peak is taken from /proc: getrusage counts what a child had of its parent before it became
     a program of its own.

@@ -1,4 +1,4 @@
-"""The release manifest: read strictly, held against the very bytes, reads back as written."""
+"""The release manifest: read strictly, compared with the image, reads back as written."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ def test_the_document_s_own_example_comes_to_613_packets() -> None:
     assert sum(result.packet_bits) / BITRATE_BPS < result.transfer_wire_s < result.wire_s
     # the same messages in bytes: 16 + 22 + 12, 14 + 20 + 13 + 13, and 144 + 13 a packet
     assert result.bytes_on_wire == 50 + 60 + 613 * 157
-    # 18 full frames of 111 bits at the least and 135 at the most, and 2 frames of ACK
+    # 18 full frames of at least 111 and at most 135 bits, and 2 frames of ACK
     assert 613 * 18 * 111 / BITRATE_BPS < result.wire_s < 613 * 20 * 135 / BITRATE_BPS
 
 

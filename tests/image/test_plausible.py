@@ -1,4 +1,4 @@
-"""What is no firmware is told by its own marks, and what does not begin like one as well."""
+"""A file that is no firmware is known by its own marks, or by a wrong beginning."""
 
 from __future__ import annotations
 

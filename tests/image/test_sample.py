@@ -83,7 +83,7 @@ def test_a_conversion_keeps_the_mark(tmp_path: Path) -> None:
         (tmp_path / "x.txt.hex").write_text(file.as_ihex())
         assert known("x.bin")
         assert known("x.s19")
-        # A file of records that is forced to be sent as it stands.
+        # A file of records that is forced to be sent as it is.
         for name in ("x.s19", "x.hex", "x.txt.hex"):
             assert known(name, format="bin")
 

@@ -56,7 +56,7 @@ class Talk:
         self._collect()
 
     def ask(self, can_id: int, mode: int, command: int, data: bytes = b"") -> list[Answer]:
-        """A message arrives; what is said to it at once."""
+        """A message arrives; its immediate answers."""
         self.take()
         self.put(can_id, mode, command, data)
         return self.take()

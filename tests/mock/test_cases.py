@@ -187,12 +187,12 @@ def test_an_impossible_size_is_refused_before_erasing_and_the_old_application_st
     assert bench.device.erase_count == 0
 
 
-@each("heard", [1, 2, 3, 4])
-def test_the_update_command_is_taken_at_each_of_the_announcements(heard: int) -> None:
+@each("received", [1, 2, 3, 4])
+def test_the_update_command_is_taken_at_each_of_the_announcements(received: int) -> None:
     """UP-04."""
     bench = Bench()
     bench.enter_bootloader()
-    bench.run(0.05 * (heard - 1) + 0.001)
+    bench.run(0.05 * (received - 1) + 0.001)
     bench.take()
     bench.send(bench.update_row(600))
     assert bench.take() == [RequestTransfer()]
@@ -432,7 +432,7 @@ def test_a_repeated_packet_with_other_data_leaves_the_first() -> None:
 
 
 def test_the_number_after_the_largest_one_is_not_asked_for() -> None:
-    """R10: NAK n+1 cannot be said of packet 65535."""
+    """R10: there is no NAK n+1 for packet 65535."""
     profile = profile_with(
         repeated_packet="nak_next", application_area_bytes=16 << 20, page_size_bytes=1 << 20
     )

@@ -174,7 +174,7 @@ def test_shutdown_is_answered_with_ready_and_the_wmc_sends_goodbye_in_the_older_
     talk.take()
     talk.put(*SHUTDOWN)
     assert questions(talk) == reported
-    # Each announcement asks anew, the goodbye is said once.
+    # Each announcement asks anew, the goodbye is sent once.
     talk.put(*SHUTDOWN)
     assert questions(talk) == reported[:1]
     talk.run(60.0)

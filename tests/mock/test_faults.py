@@ -213,7 +213,7 @@ def test_what_was_half_sent_is_lost_and_what_the_device_does_meanwhile_goes_on()
     device.bus_off(tool.now, 0.05)
     tool.run(0.1)
     assert tool.heard("request") == []
-    # It erased and waits for packet 1; its request is said again to an update command again.
+    # It erased and waits for packet 1; another update command gets its request again.
     assert device.state is BootloaderState.TRANSFER
     tool.update(600)
     tool.run(0.001)

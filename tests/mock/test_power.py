@@ -152,20 +152,22 @@ def test_the_upgrade_is_as_many_frames_as_the_cuts_below_go_through() -> None:
 
 @pytest.mark.slow
 @pytest.mark.no_cover
-@each("heard", range(ALL_FRAMES + 1))
-def test_a_power_cut_at_any_received_frame_leaves_the_old_application_or_none(heard: int) -> None:
+@each("received", range(ALL_FRAMES + 1))
+def test_a_power_cut_at_any_received_frame_leaves_the_old_application_or_none(
+    received: int,
+) -> None:
     """PW-01. The cut comes 1 ms after the frame: the flash is at work when that frame was the last
     one of a message.
     """
     bench = bench_with_old()
-    for frame in upgrade_frames(bench)[:heard]:
+    for frame in upgrade_frames(bench)[:received]:
         if bench.device.state in BUSY:
             bench.run_to(BootloaderState.TRANSFER)
         bench.put(frame)
-    assert heard < ALL_FRAMES or bench.device.state is BootloaderState.CHECKING
+    assert received < ALL_FRAMES or bench.device.state is BootloaderState.CHECKING
     bench.run(0.001)
     cycle_power(bench)
-    assert boots_only_what_is_whole(bench) == (OLD if heard < UPDATE_FRAMES else None)
+    assert boots_only_what_is_whole(bench) == (OLD if received < UPDATE_FRAMES else None)
     bench.upgrade(NEW)
     assert bench.device.stored_image == NEW
 
@@ -221,7 +223,7 @@ def test_power_that_is_on_already_changes_nothing() -> None:
 
 @each("flipped_byte", [0, 300, 599])
 def test_an_image_that_was_altered_in_the_flash_does_not_boot(flipped_byte: int) -> None:
-    """R7: what is stored is held against its record at every start."""
+    """R7: what is stored is compared with its record at every start."""
     bench = Bench(SMALL)
     bench.upgrade(NEW)
     flash = bench.device.store.flash

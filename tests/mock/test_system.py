@@ -1,4 +1,4 @@
-"""A whole bicycle on a simulated bus: what is said in 30 s, its bus load, upgrades meanwhile."""
+"""A whole bicycle on a simulated bus: its messages in 30 s, its bus load, upgrades meanwhile."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each deliberately wrong device does the one thing that it is said to do wrong, and the right one
+"""Each deliberately wrong device does the one thing that it declares wrong, and the right one
 does not; apart from that it can be upgraded.
 """
 

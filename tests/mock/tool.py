@@ -25,7 +25,7 @@ _NAMES = {
 
 
 class Tool:
-    """Talks to one BMS; what it heard is told in words: `ack 3`, `version`, `720 1540`."""
+    """Talks to one BMS; names what it received: `ack 3`, `version`, `720 1540`."""
 
     def __init__(self, device: MockDevice) -> None:
         self.device = device
@@ -71,7 +71,7 @@ class Tool:
         self.say(0x4205, b"RESET")
 
     def boot(self) -> None:
-        """Reset; the first boot version has been said afterwards."""
+        """Reset, and wait for the first boot version."""
         self.reset()
         self.run(0.055)
         self.heard()
@@ -98,7 +98,7 @@ class Tool:
         self.heard()
 
     def upgrade(self, image: bytes) -> list[str]:
-        """A whole upgrade; what is said to the end of transfer."""
+        """A whole upgrade; the answers to the end of transfer."""
         self.transfer(image, -(-len(image) // 128))
         self.end()
         answers = self.heard()
@@ -117,7 +117,7 @@ class Tool:
         self.run(0.005)
         return self.heard()
 
-    # -- what was heard ---------------------------------------------------------------------------
+    # -- received messages ------------------------------------------------------------------------
 
     def heard(self, kind: str = "") -> list[str]:
         """Messages since the last call; those of one kind, or all."""

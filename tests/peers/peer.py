@@ -18,7 +18,7 @@ _OVERHEAD_SIZE: Final = 9
 
 
 class Entry(NamedTuple):
-    """One line of a peer's log: `kind` is heard, said or note."""
+    """One line of a peer's log: `kind` is received, sent or note."""
 
     at: float
     kind: str
@@ -26,7 +26,7 @@ class Entry(NamedTuple):
     number: int = 0
 
 
-class _Said(NamedTuple):
+class _Outgoing(NamedTuple):
     not_before: float
     order: int
     what: str
@@ -44,7 +44,7 @@ class Peer:
         self.says_id = says_id
         self._partial = b""
         self._partial_at = 0.0
-        self._outbox: list[_Said] = []
+        self._outbox: list[_Outgoing] = []
         self._sent_frames = 0
         self._order = 0
         self._alarms: list[tuple[float, int, Callable[[float], None]]] = []
@@ -62,7 +62,7 @@ class Peer:
         raise NotImplementedError
 
     def heard(self, what: str, now: float, number: int = 0) -> None:
-        self.log.append(Entry(now, "heard", what, number))
+        self.log.append(Entry(now, "received", what, number))
 
     def note(self, what: str, now: float, number: int = 0) -> None:
         self.log.append(Entry(now, "note", what, number))
@@ -93,10 +93,10 @@ class Peer:
     ) -> None:
         """The same with frames of any kind."""
         self._order += 1
-        self._outbox.append(_Said(not_before, self._order, what, number, frames, then))
+        self._outbox.append(_Outgoing(not_before, self._order, what, number, frames, then))
 
     def hush(self) -> None:
-        """Say nothing of what is not begun."""
+        """Send nothing that is not begun."""
         self._outbox = self._outbox[:1] if self._sent_frames else []
 
     def alarm(self, at: float, action: Callable[[float], None]) -> None:
@@ -107,11 +107,11 @@ class Peer:
     def clear_alarms(self) -> None:
         self._alarms.clear()
 
-    def times(self, what: str, kind: str = "heard") -> list[float]:
-        """When a message was heard (or said), or a note made."""
+    def times(self, what: str, kind: str = "received") -> list[float]:
+        """When a message was received (or sent), or a note made."""
         return [entry.at for entry in self.log if (entry.kind, entry.what) == (kind, what)]
 
-    def numbers(self, what: str, kind: str = "heard") -> list[int]:
+    def numbers(self, what: str, kind: str = "received") -> list[int]:
         """The packet numbers of the messages of that name."""
         return [entry.number for entry in self.log if (entry.kind, entry.what) == (kind, what)]
 
@@ -172,7 +172,7 @@ class Peer:
             return
         self._outbox.pop(0)
         self._sent_frames = 0
-        self.log.append(Entry(now, "said", reported.what, reported.number))
+        self.log.append(Entry(now, "sent", reported.what, reported.number))
         if reported.then is not None:
             reported.then(now)
 

@@ -63,7 +63,7 @@ class DeviceScript:
     nak: Mapping[int, int] = field(default_factory=dict)
     """So many copies of the packet are refused."""
     silent_after: int | None = None
-    """After this packet's ACK nothing more is said; 0 means after the request."""
+    """After this packet's ACK nothing more is sent; 0 means after the request."""
     restart_at: int | None = None
     """On this packet the device restarts and announces itself."""
     request_at: int | None = None

@@ -1,7 +1,7 @@
 """The tool's side in its own words: a plain, right upgrade, and ways to stray from it.
 
 What strays is either a first copy of a packet that is damaged on its way, or an aside: something
-said out of turn, whose answers are collected for a while before the upgrade goes on.
+sent out of turn, whose answers are collected for a while before the upgrade goes on.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class Limits:
 
 class ScriptedHost(Peer):
     """Upgrades one target with `image`. `outcome` is empty until it ends, then "complete" or what
-    went wrong; `asides` holds the answers to what was said out of turn, as (name, number).
+    went wrong; `asides` has the answers to what was sent out of turn, as (name, number).
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class ScriptedHost(Peer):
 
     @property
     def done(self) -> bool:
-        """True when the outcome is known and everything is said."""
+        """True when the outcome is known and everything is sent."""
         return super().done or (self.outcome != "" and not self._outbox)
 
     # -- listening ----------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""The scripted device strays exactly as told, and a plain host gets through or names it."""
+"""The scripted device strays exactly as set, and a plain host gets through or names it."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_lost_versions_are_just_these() -> None:
 def test_a_version_that_changes_within_a_burst_counts_as_another_one() -> None:
     host, device = upgrade(DeviceScript(version_changes=True), HostScript(update_on_version=2))
     assert_upgraded(host, device)
-    assert len(device.times("version", "said")) == 2
+    assert len(device.times("version", "sent")) == 2
 
 
 def test_acks_are_dropped_doubled_and_late_where_set() -> None:
@@ -92,7 +92,7 @@ def test_acks_are_dropped_doubled_and_late_where_set() -> None:
 def test_an_answer_can_be_ack_and_nak_for_one_packet() -> None:
     host, device = upgrade(DeviceScript(nak_then_ack=frozenset({2}), ack_then_nak=frozenset({10})))
     assert device.image == IMAGE
-    assert device.numbers("nak", "said") == [2, 10]
+    assert device.numbers("nak", "sent") == [2, 10]
     assert host.numbers("nak")[0] == 2
 
 

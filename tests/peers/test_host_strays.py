@@ -1,4 +1,4 @@
-"""The scripted host strays exactly as told, and a plain device stays right."""
+"""The scripted host strays exactly as set, and a plain device stays right."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_a_damaged_first_copy_is_refused_or_not_answered_and_sent_again(
     host, device = upgrade(host=script)
     assert_upgraded(host, device)
     assert host.numbers("nak") == naks
-    assert host.numbers("packet", "said").count(3) == 2
+    assert host.numbers("packet", "sent").count(3) == 2
 
 
 @each(

@@ -41,7 +41,7 @@ def test_a_dialogue_has_the_documents_order() -> None:
         *("reset", "feedback", "version", "update", "request"),
         *("packet", "ack", "end", "complete", "complete"),
     ]
-    assert [entry.what for entry in device.log if entry.kind == "heard"] == [
+    assert [entry.what for entry in device.log if entry.kind == "received"] == [
         *("reset", "update", "packet", "end"),
     ]
     assert device.take_events() == device.log
@@ -50,7 +50,7 @@ def test_a_dialogue_has_the_documents_order() -> None:
 
 def test_announcements_come_four_times_fifty_milliseconds_apart_then_the_application() -> None:
     host, device = upgrade(host=HostScript(update_on_version=99))
-    reported = device.times("version", "said")
+    reported = device.times("version", "sent")
     assert len(reported) == 4
     gaps_s = [later - sooner for sooner, later in itertools.pairwise(reported)]
     assert gaps_s == pytest.approx([0.05] * 3, abs=2 * FRAME_S)

@@ -1,1 +1,1 @@
-"""What flasher.protocol promises, held against the documents' own bytes and plain references."""
+"""flasher.protocol, compared with the documents' own bytes and with plain references."""

@@ -146,8 +146,8 @@ CONTAINERS: dict[str, Callable[[bytes], bytes]] = {
     "a link": lambda raw: with_entry(
         raw, "images/link", b"/etc/passwd", external_attr=0o120777 << 16
     ),
-    "notes that nobody signed": lambda raw: changed(raw, **{NOTES: b"use --force"}),
-    "an image that nobody signed": lambda raw: changed(raw, **{"images/other.hex": b":00"}),
+    "unsigned notes": lambda raw: changed(raw, **{NOTES: b"use --force"}),
+    "an unsigned image": lambda raw: changed(raw, **{"images/other.hex": b":00"}),
     "too many files": lambda raw: changed(
         raw, **{f"images/{number}.hex": b"" for number in range(20)}
     ),

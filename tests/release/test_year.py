@@ -22,7 +22,7 @@ from tests.release.maker import Maker, chain_of, first_trust, opened, role, trus
 
 
 class Workshop:
-    """A computer that flashes releases, on days that it is told."""
+    """A computer that flashes releases, on given days."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

@@ -176,7 +176,7 @@ def story(*upgrades: UpgradeStory, source: str = "upgrade.asc") -> Story:
         verdict = upgrades[0].verdict
     else:
         verdict = TraceVerdict(
-            Cause.QUERIES_ONLY, None, None, 0, "Nobody upgraded anything: 2 queries were answered."
+            Cause.QUERIES_ONLY, None, None, 0, "No tool upgraded anything: 2 queries were answered."
         )
         steps = (
             says(0.5, "OBC>BMS", "read running information"),

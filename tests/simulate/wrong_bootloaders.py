@@ -45,7 +45,7 @@ class ForgetsTheRecord(PythonBootloader):
 
 
 class TrustsTheRecord(PythonBootloader):
-    """It erases the record last, and does not check what it stands for."""
+    """It erases the record last, and does not check what that describes."""
 
     def _begin(self, size: int) -> None:
         erase = self.host.flash_erase

@@ -92,7 +92,7 @@ def _manual(command: click.Command, path: str, *, level: int) -> _Lines:
 
 
 def _prose(text: str) -> str:
-    """Help as Markdown: what stands in `...` stays, and nothing else is a mark."""
+    """Help as Markdown: text in `...` stays, and nothing else is a mark."""
     parts = re.split(r"(`[^`]*`)", text)
     return "".join(
         part if part.startswith("`") else re.sub(r"([<>*_\[\]{}|\\#])", r"\\\1", part)
@@ -215,7 +215,7 @@ def _documents(prefix: str) -> _Lines:
             continue
         yield from (f"## {title}", "")
         forms = form.get("anyOf", [form])
-        # The last one is how a failure looks, which is said once for all of them.
+        # The last one is the failure, which is described once for all of them.
         for each in forms[:-1] if prefix == "document" else forms:
             yield from (_prose(each.get("description", "")), "")
             if "enum" in each:

@@ -100,7 +100,7 @@ QUESTIONS: Final = (
     ),
     Question(
         "line",
-        "How does an auditor see that nobody has changed the records?",
+        "How does an auditor see that the records are unchanged?",
         "how-to/station_records.html#tell-whether-records-were-changed",
         "compares the trail with its hashes",
     ),

@@ -1,4 +1,4 @@
-"""Recipes, clocks and records for the station's tests: small images, time that stands still."""
+"""Recipes, clocks and records for the station's tests: small images, a stopped clock."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def make_recipe(folder: Path, text: str = USUAL) -> LoadedRecipe:
 
 @dataclass
 class FakeClock:
-    """Stands still until it is told to go on."""
+    """Stops until `go_on`."""
 
     now: datetime = datetime(2026, 5, 17, 9, 0, tzinfo=UTC)
     seconds: float = 100.0

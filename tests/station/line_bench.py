@@ -1,4 +1,4 @@
-"""A station whose sockets' processes are scripted: no bus, a clock that stands still."""
+"""A station whose sockets' processes are scripted: no bus, a stopped clock."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ class LineBench:
         self.turn()
 
     def arrive(self, socket: str, serial: str | None = "") -> None:
-        """A unit is heard that says this serial number: empty, it has none; None, not said yet.
+        """A unit that reports this serial number: empty, it has none; None, not reported yet.
         A person needs a moment to connect it.
         """
         self.bench.clock.go_on(2.0)
@@ -173,7 +173,7 @@ class LineBench:
         self.say(socket, PresenceChanged(is_there=False, is_certain=True))
 
     def fall_silent(self, socket: str) -> None:
-        """Nothing is heard any more: the unit was removed, or it sleeps."""
+        """The unit is silent: it was removed, or it sleeps."""
         self.say(socket, PresenceChanged(is_there=False))
 
     def scan(self, text: str) -> None:

@@ -59,11 +59,11 @@ class Bay:
     unit: Unit | None = None
     works: bool = True
     noted: tuple[bool, str | None] | None = None
-    """What its process said last of the unit; None: nothing since it began, or since a run."""
+    """The last report of its process on the unit; None since the process or a run began."""
     run: str = ""
     """The label that its process works on."""
     differs_since: float | None = None
-    """Since when what its process said is not so any more."""
+    """Since when the last report of its process is outdated."""
 
 
 @dataclass
@@ -94,7 +94,7 @@ class World:
         self.disk_works = True
         self.shown: dict[str, SocketChanged] = {}
         self.heard: list[StationEvent] = []
-        """What the screen said since the operator looked last."""
+        """What the screen showed since the operator last looked."""
         self.in_hand: Unit | None = None
         self.start()
 
@@ -170,7 +170,7 @@ class World:
             each.card for each in self.line._waiting.values()
         )
         holder = next((s for s in self.line.sockets.values() if s.own == text), None)
-        self.way = "card" if is_card or holder is None else "said by the unit"
+        self.way = "card" if is_card or holder is None else "reported by the unit"
         self.line.scan(text, self.now)
         self.write_planned()
 
@@ -285,7 +285,7 @@ class World:
             assert saved is RunState.PASS, f"PASS of {event.serial} is shown and not saved"
 
     def check_green(self) -> None:
-        """PASS stands over no other unit that is heard."""
+        """PASS is shown over no other unit that is detected."""
         for name, event in self.shown.items():
             unit, noted = self.bays[name].unit, self.bays[name].noted
             if event.state is SocketState.PASS and unit is not None and noted and noted[0]:
@@ -382,7 +382,7 @@ class Operator:
         return any(bay.run == unit.label for bay in self.world.bays.values())
 
     def follow(self, unit: Unit) -> str:
-        """Do what was said last; what to scan next, where it is not the label."""
+        """Do what was asked last; what to scan next, where it is not the label."""
         reported = [e for e in self.world.heard if isinstance(e, ScanRefused | OperatorPrompted)]
         for event in reversed(reported):
             refused = isinstance(event, ScanRefused)
@@ -497,7 +497,7 @@ class Walk:
     def sleep(self) -> None:
         _, bay = self.some()
         unit = bay.unit
-        # Nobody puts a unit in that sleeps: it falls asleep after it was heard.
+        # A unit is put in awake: it falls asleep after it was detected.
         if unit is not None and (unit.is_asleep or (bay.noted and bay.noted[0])):
             unit.is_asleep = not unit.is_asleep
             self.world.note(f"{unit}")

@@ -97,7 +97,7 @@ class Exchange:
         self.look()
 
     def while_the_record_is_saved(self, *note: str) -> None:
-        """The same, and the records take their time: the run hears nobody meanwhile."""
+        """The same, and saving takes time: the run receives nothing meanwhile."""
         self.at_note(*note)
 
         def save_slowly() -> None:
@@ -258,7 +258,7 @@ def test_a_unit_that_is_exchanged_while_no_one_listens(
 def test_a_unit_that_is_exchanged_while_the_run_waits_for_another_try(
     tmp_path: Path, numbers: tuple[str, str]
 ) -> None:
-    """Long after the pause has begun: nobody would have asked without a reason."""
+    """Long after the pause has begun: there is no other reason to ask."""
     limit = '\n[[limit]]\ntarget = "bms"\nitem = "running-information"\nfield = "voltage_mv"\n'
     text = f"{USUAL}{WRITES}{limit}low = 1\nhigh = 2\n[step.check]\ntries = 3\npause_s = 60\n"
     world = Exchange(tmp_path, numbers, text=text, gap_s=20)
@@ -283,7 +283,7 @@ def lose_power_once(bench: UnitBench, off_s: float) -> None:
 
 
 def test_the_power_of_one_unit_that_fails_is_no_different(tmp_path: Path) -> None:
-    """It is the same one, but nobody can know."""
+    """It is the same one, but that cannot be known."""
     bench = UnitBench(tmp_path)
     lose_power_once(bench, 1.0)
     result = bench.run()
@@ -723,7 +723,7 @@ def test_what_a_computer_that_stalls_did_not_see_does_not_accuse_the_unit(
 def test_units_in_their_bootloaders_that_change_places_while_no_one_listens(
     tmp_path: Path, note: tuple[str, ...], gap_s: float
 ) -> None:
-    """Nothing speaks for another one, but nobody has seen that it is the same."""
+    """Nothing shows another one, but nothing shows that it is the same."""
     world = Exchange(tmp_path, gap_s=gap_s)
     world.bench.put(without_application())
     world.second = without_application()

@@ -543,7 +543,7 @@ def test_a_device_that_takes_nothing(tmp_path: Path) -> None:
     os.mkfifo(path)
     send = printer_of(configured(printer=f"file:{path}"))
     with pytest.raises(NotPrinted, match="cannot be reached"):
-        send(b"x", LIMIT_S)  # nobody reads
+        send(b"x", LIMIT_S)  # without a reader
     reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     with pytest.raises(NotPrinted, match="longer than"):
         send(b"x" * 1_000_000, 0.05)

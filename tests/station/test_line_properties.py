@@ -48,7 +48,7 @@ def test_no_label_runs_on_another_unit_and_nothing_blocks(sockets: tuple[str, ..
     seen = walks(sockets, steps)
     assert seen["run"] > steps / 10
     if len(sockets) > 1:
-        ways = ("named", "card", "said by the unit")
+        ways = ("named", "card", "reported by the unit")
         assert all(seen[way] > steps / 500 for way in ways), seen
 
 

@@ -135,16 +135,16 @@ STORIES = {
         " @3.0 put unit=2 socket=A ; @4.0 card by=jo unit=2 ; @6.0 label by=jo unit=2 ;"
         " @7.5 pull unit=2 ; @8.0 put unit=1 socket=A"
     ),
-    "a process that stands still": (
+    "a process that stalls": (
         "line sockets=2 ; unit label=1 ; person name=jo source=jo ; @3.0 put unit=1 socket=B ;"
         " @16.0 stall socket=B seconds=4.0 ; @18.0 card by=jo unit=1 ; @19.0 label by=jo unit=1"
     ),
-    "a process that stands still beside a bootloader": (
+    "a process that stalls beside a bootloader": (
         "line sockets=2 ; unit label=1 application=none ; person name=jo source=jo ;"
         " @3.0 put unit=1 socket=B ; @16.0 stall socket=B seconds=4.0 ; @18.0 card by=jo unit=1 ;"
         " @19.0 label by=jo unit=1"
     ),
-    "bootloaders that change places while a process stands still": (
+    "bootloaders that change places while a process stalls": (
         "line sockets=2 ; unit label=1 application=none ; unit label=3 application=none ;"
         " person name=mo ; @3.0 put unit=3 socket=A ; @8.0 card by=mo unit=3 ;"
         " @9.0 stall socket=A seconds=2.0 ; @9.3 pull unit=3 ; @10.0 put unit=1 socket=A ;"
@@ -257,7 +257,7 @@ STORIES = {
         " person name=jo source=mounted ; @11.8 put unit=2 socket=A ; @27.0 label by=jo unit=2 ;"
         " @27.5 pull unit=2 ; @31.5 put unit=2 socket=A"
     ),
-    "pulled before the process of its socket stands still": (
+    "pulled before the process of its socket stalls": (
         "line sockets=2 ; unit label=1 pace=slow ; person name=mo ; @3.0 put unit=1 socket=B ;"
         " @4.0 card by=mo unit=1 ; @5.0 label by=mo unit=1 ; @32.0 pull unit=1 ;"
         " @33.0 stall socket=B seconds=4.0 ; @36.5 look"
@@ -293,17 +293,17 @@ STORIES = {
         " @3.5 put unit=2 socket=A ; @5.3 label by=mo unit=2 ; @5.9 unplug socket=A seconds=2.0 ;"
         " @6.1 pull unit=2 ; @6.4 put unit=4 socket=A"
     ),
-    "exchanged while the process stands still, after its image was complete": (
+    "exchanged while the process stalls, after its image was complete": (
         "line sockets=1 ; unit label=2 ; unit label=4 application=new ; person name=mo ;"
         " @3.5 put unit=2 socket=A ; @5.3 label by=mo unit=2 ; @5.9 stall socket=A seconds=2.0 ;"
         " @6.1 pull unit=2 ; @6.4 put unit=4 socket=A"
     ),
-    "pulled while the process stands still, before it is reset": (
+    "pulled while the process stalls, before it is reset": (
         "line sockets=1 ; unit label=2 ; unit label=4 application=new ; person name=mo ;"
         " @3.5 put unit=2 socket=A ; @5.2 card by=mo unit=2 ; @5.3 label by=mo unit=2 ;"
         " @5.7017 stall socket=A seconds=1.0 ; @5.8017 pull unit=2 ; @6.8017 put unit=4 socket=A"
     ),
-    "pulled while the process stands still, before the end of its transfer": (
+    "pulled while the process stalls, before the end of its transfer": (
         "line sockets=1 ; unit label=2 ; unit label=4 application=new ; person name=mo ;"
         " @3.5 put unit=2 socket=A ; @5.2 card by=mo unit=2 ; @5.3 label by=mo unit=2 ;"
         " @5.8747 stall socket=A seconds=1.0 ; @5.9747 pull unit=2 ; @6.9747 put unit=4 socket=A"
@@ -340,7 +340,7 @@ STORIES = {
         " @17.17 card by=jo unit=2 ; @17.2 label by=jo unit=2 ; @18.0 pull unit=2 ;"
         " @22.0 put unit=2 socket=A ; @23.5 pull unit=2 ; @24.0 put unit=1 socket=A"
     ),
-    "put in while the process of the socket stands still": (
+    "put in while the process of the socket stalls": (
         "line sockets=1 recipe=wmc ; unit label=1 ; unit label=2 ; person name=jo ;"
         " @3.0 stall socket=A seconds=4.0 ; @4.0 label by=jo unit=1 ; @5.0 put unit=2 socket=A"
     ),
@@ -436,7 +436,7 @@ def test_a_unit_that_no_one_could_ask_is_counted_by_how_it_was_exchanged(again: 
 
 
 def test_a_unit_that_an_aborted_run_left_silent_in_its_transfer_is_scanned_twice() -> None:
-    """Nobody can tell it from one that was pulled: the first scan ends as UNIT_CHANGED."""
+    """It looks like one that was pulled: the first scan ends as UNIT_CHANGED."""
     played = noted(
         "line sockets=1 recipe=held ; unit label=2 pace=slow ; person name=jo ; person name=al ;"
         " @3.0 put unit=2 socket=A ; @19.0 label by=jo unit=2 ; @20.0 station seconds=1.0 ;"
@@ -509,7 +509,7 @@ def test_the_campaign_names_each_word_of_a_story_and_each_kind_of_violation() ->
 
 @pytest.mark.parametrize("seed", range(SAMPLE))
 def test_a_drawn_story_has_no_violation_and_is_read_as_it_is_printed(seed: int) -> None:
-    """The first seeds that there are: nobody has chosen them."""
+    """The first seeds that there are, not chosen ones."""
     played = draw(seed, SAMPLE_ACTS)
     assert not played.kind, f"{played.text}\n  {played.story}"
     assert Story.parse(str(played.story)) == played.story
@@ -573,7 +573,7 @@ def test_no_step_puts_a_unit_where_another_one_is_awaited() -> None:
     assert [each.NAME for each in noted(without).done] == ["card", "put"]
 
 
-# -- what nobody can detect ------------------------------------------------------------------------
+# -- what cannot be detected -----------------------------------------------------------------------
 
 RESET = "between the confirmed reset and the announcement"
 COMPLETE = "between the complete image and the first answer"

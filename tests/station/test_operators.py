@@ -1,4 +1,4 @@
-"""Badges, roles and PINs: who may do what, and a PIN is seen by nobody."""
+"""Badges, roles and PINs: who may do what, and no PIN is shown."""
 
 from __future__ import annotations
 

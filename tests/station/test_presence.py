@@ -95,7 +95,7 @@ def test_after_a_time_in_which_nothing_could_be_received_nothing_is_known(
     presence(TRAFFIC, sent=False, now=61.0)
     change = presence.change(61.0)
     assert change is not None
-    assert change.is_there, "said once more, although it was there before"
+    assert change.is_there, "reported once more, although it was there before"
 
 
 def version_answer(serial: str) -> list[Frame]:
@@ -108,7 +108,7 @@ def test_a_version_answer_identifies_its_unit(presence: Presence) -> None:
     presence(TRAFFIC, sent=False, now=1.0)
     change = presence.change(1.0)
     assert change is not None
-    assert change.serial is None, "not said yet"
+    assert change.serial is None, "not reported yet"
     for serial in ("", "W2605002"):
         for frame in version_answer(serial):
             presence(frame, sent=False, now=1.5)
@@ -248,7 +248,7 @@ def test_time_in_which_no_one_listened_is_no_pause(presence: Presence) -> None:
 def test_a_bootloader_that_no_one_listened_to_may_be_another_one(presence: Presence) -> None:
     announce(presence, 1.0, 1.05)
     presence.miss(0.2, 1.3)
-    assert presence.change(1.3) is None, "nobody exchanges it so fast"
+    assert presence.change(1.3) is None, "no person exchanges it so fast"
     presence.miss(1.0, 2.3)
     change = presence.change(2.3)
     assert change is not None

@@ -132,7 +132,7 @@ def test_counts_of_units_have_one_form(report: Report) -> None:
 
 
 def test_a_certificate_of_an_older_flasher_is_read_as_it_was_signed() -> None:
-    """It has levels as numbers and states in capitals; nobody writes it anew."""
+    """It has levels as numbers and states in capitals, and is not migrated."""
     sealed = sealed_in(OLD_CERTIFICATE.read_text(encoding="ascii"))
     assert sealed.earlier[0]["verified"] == 1
     assert sealed.wrong() == []

@@ -66,7 +66,7 @@ def stack() -> Iterator[ExitStack]:
 
 
 class Reading:
-    """A scanner's thread, and what it said."""
+    """A scanner's thread, and what it reported."""
 
     def __init__(self, stack: ExitStack, path: str, socket: str) -> None:
         self.scans: list[tuple[str, str]] = []

@@ -292,7 +292,7 @@ def test_a_label_is_where_it_was_scanned_last(recipe: LoadedRecipe) -> None:
 
 
 def test_a_label_of_another_source_can_be_freed_everywhere(recipe: LoadedRecipe) -> None:
-    """Its page is closed, and nobody can scan CANCEL there."""
+    """Its page is closed, so that CANCEL cannot be scanned there."""
     floor = Floor(recipe)
     floor.scan("FREE A")
     floor.scan("W1", TWO)
@@ -434,7 +434,7 @@ def test_green_does_not_come_back_to_an_empty_socket(recipe: LoadedRecipe) -> No
 def test_green_outlives_an_outage_only_with_a_unit_that_states_who_it_is(
     recipe: LoadedRecipe, own: str, outage_s: float
 ) -> None:
-    """However short: another one may be there, whose announcement nobody heard."""
+    """However short: another one may be there, whose announcement was missed."""
     floor = Floor(recipe)
     floor.put_all(*pair((own, "")))
     floor.scan("SOCKET A")
@@ -548,7 +548,7 @@ def test_a_bootloader_that_goes_on_announcing_is_no_arrival(recipe: LoadedRecipe
 
 def steps(floor: Floor, chance: random.Random, count: int) -> Iterable[str]:
     """People at two sources, each with a socket and its unit, who are interrupted by each other,
-    and change units at any time. What each of them does is told.
+    and change units at any time. Yields what each of them does.
     """
     units = {name: Unit(f"W{at + 1}") for at, name in enumerate(floor.names)}
     table: deque[Unit] = deque(Unit(f"W{at}") for at in range(5, 9))

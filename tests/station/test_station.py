@@ -168,7 +168,7 @@ def test_two_waiting_units_need_a_chosen_socket(line: LineBench) -> None:
 
 
 def test_a_label_that_is_scanned_while_sockets_start_goes_to_no_unit(bench: Bench) -> None:
-    """Two units wait, only the label of B's is scanned: the first one to be heard is A's."""
+    """Two units wait, only the label of B's is scanned: the first one to be detected is A's."""
     line = LineBench(bench, are_empty=False)
     line.scan(OTHER)
     refused = line.last(ScanRefused)
@@ -309,7 +309,7 @@ def test_a_label_without_its_unit_is_forgotten(line: LineBench) -> None:
 def test_scans_that_waited_while_their_unit_was_exchanged_are_refused(
     bench: Bench, sockets: str, is_exchanged: bool, are_read_late: bool
 ) -> None:
-    """The station stands still, because of its disk or as a whole: scans and reports come at
+    """The station stalls, because of its disk or as a whole: scans and reports come at
     once.
     """
     line = LineBench(bench, sockets)
@@ -378,7 +378,7 @@ def test_the_unit_of_an_interrupted_run_is_asked_for_where_it_was(bench: Bench) 
     line.arrive("A")
     assert line.of(RunStarted) == []
     line.scan("SOCKET B")
-    assert line.order("B").kind is RunKind.RECHECK, "also where nothing is heard of it"
+    assert line.order("B").kind is RunKind.RECHECK, "also where it is silent"
 
 
 def test_green_goes_when_a_unit_that_has_passed_falls_silent_in_its_next_answer(
@@ -542,7 +542,7 @@ def test_a_unit_that_passed_before_is_refused_by_the_records(line: LineBench) ->
     assert line.text("A") == f"{refused.reason} {refused.remedy}"
     line.fall_silent("A")
     line.arrive("A")
-    assert line.text("A") == "Scan the label of the unit and SOCKET A.", "it was said of another"
+    assert line.text("A") == "Scan the label of the unit and SOCKET A.", "it was about another"
     line.scan("SOCKET A")
     line.scan(OTHER)
     assert line.state("A") is SocketState.RUNNING

@@ -211,7 +211,7 @@ def test_a_measurement_is_compared_with_its_limits(
 
 def test_a_write_that_does_not_stay_fails(tmp_path: Path) -> None:
     bench = UnitBench(tmp_path)
-    # The device is never told: its write of the user string does not reach it.
+    # The write of the user string never reaches the device.
     bench.device.profile = replace(NEW_UNIT, silent_queries="3A10")
     application = bench.device.application
     assert isinstance(application, BmsApplication)

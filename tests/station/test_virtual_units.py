@@ -212,7 +212,7 @@ def until_something(socket: VirtualSocket) -> PresenceChanged:
         socket.clock.wait_until(socket.clock.now() + 0.5)
         if change := socket.step():
             return change
-    raise AssertionError("nobody comes or goes")
+    raise AssertionError("no unit comes or goes")
 
 
 def test_a_computer_that_is_slow_accuses_no_virtual_unit(

@@ -463,7 +463,7 @@ def test_a_unit_that_stays_is_run_at_once(tmp_path: Path) -> None:
 
 
 class PulledAfterItsRun(RealSocket):
-    """The unit is pulled out as soon as it is heard after its run, and missed some time later."""
+    """The unit is pulled out once it is detected after its run, and missed some time later."""
 
     pulled_at = gone_at = inf
 
@@ -479,7 +479,7 @@ class PulledAfterItsRun(RealSocket):
 
 
 def test_a_unit_that_is_pulled_after_its_run_is_missed_soon(tmp_path: Path) -> None:
-    """Nobody has watched for units in the run: that is no pause of the watch after it."""
+    """The run does not watch for units: that is no pause of the watch after it."""
     socket = PulledAfterItsRun(tmp_path)
     socket.line = StationPipe(socket.channel, socket.clock.now)
     socket.work()
@@ -503,7 +503,7 @@ class InBootloader(RealSocket):
 
 
 class StandsStill(InBootloader):
-    """This computer stands still before the order arrives, which was given before it."""
+    """This computer stalls before the order arrives, which was given before that."""
 
     is_ordered = False
 
@@ -654,7 +654,7 @@ def test_a_label_is_not_for_the_unit_that_is_put_in_after_it(
     ended = socket.work()
     assert ended is not None
     assert ended.outcome is not RunState.PASS
-    # Nobody answers, and nobody comes as long as the run waits.
+    # No unit answers, and none comes as long as the run waits.
     codes = ("UNIT_CHANGED", "NO_ANSWER") if gap_s > 0.5 else ("UNIT_CHANGED",)
     assert ended.code in codes, ended.text
     assert socket.other.device.program_count == 0
@@ -697,7 +697,7 @@ def test_a_run_is_not_for_the_unit_that_comes_after_it_began(
 def test_a_slow_start_of_a_run_is_no_pause_of_a_unit_in_its_bootloader(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """This computer makes a plan of the image, and nobody listens meanwhile."""
+    """This computer plans the image, and does not listen meanwhile."""
     socket = InBootloader(tmp_path)
     real = UnitRun._steps
 

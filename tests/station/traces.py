@@ -19,7 +19,7 @@ from flasher.protocol.wire import Message, encode, split
 def run_messages(
     serial: str, version: str, image: Image | None, *, written: str = ""
 ) -> Iterator[Message]:
-    """What a good run of a BMS says that is held against its records."""
+    """The messages of a good run of a BMS that are compared with its records."""
     if image is not None:
         yield from transfer(BMS, image)
     if written:

@@ -156,7 +156,7 @@ class UnitBench:
 
     def save_slowly(self, seconds: float, *, listens: bool) -> None:
         """Let the records take their time for each note; while it `listens`, the run hears what
-        comes, as the process of a socket does, else the computer stands still.
+        comes, as the process of a socket does, else the computer stalls.
         """
 
         def save() -> None:

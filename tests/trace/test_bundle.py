@@ -31,7 +31,7 @@ MIXED = [
 
 
 def recorded(tape: Tape) -> FlightRecorder:
-    """The recorder of a tool that heard and said this; its clock starts at 50."""
+    """The recorder of a tool that received and sent this; its clock starts at 50."""
     recorder = FlightRecorder(wall_clock=lambda: tape.frames[0][0])
     for at, frame in tape:
         recorder(frame, sent=frame.can_id == 0x752, now=at - START_S + 50)

@@ -1,4 +1,4 @@
-"""Echoes of an adapter: in a trace, a frame that was sent stands once."""
+"""Echoes of an adapter: a trace has a sent frame once."""
 
 from __future__ import annotations
 

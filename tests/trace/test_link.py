@@ -28,7 +28,7 @@ def test_on_a_line_the_answer_time_of_the_device_is_measured() -> None:
     report = measured(1).report()
     assert report is not None
     assert report.device_answer is not None
-    # An ACK is two frames and may lag behind the reckoned end of its packet.
+    # An ACK is two frames and may come after the computed end of its packet.
     assert 0 < report.device_answer.median_s < 5 * FRAME_S
 
 

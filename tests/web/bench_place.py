@@ -80,7 +80,7 @@ class HeldBikes(VirtualBikes):
 def order(
     step: Callable[Concatenate[BenchController, P], None], *args: P.args, **named: P.kwargs
 ) -> Order:
-    """A step with what is said of it."""
+    """An order of this step, with its arguments."""
     return lambda bench: step(bench, *args, **named)
 
 

@@ -202,7 +202,7 @@ def test_a_check_is_waived_in_a_second_step_that_names_the_risk(page: Page) -> N
     )
     assert page.locator("#refused details[data-was]").count() > 0
     expect(page.locator("#refused details.waive[open]")).to_have_count(1)
-    # The next one is about another file, which nobody has looked at.
+    # The next one is about another file, which was not examined.
     page.evaluate(
         "() => apply({parts: {"
         "refused: byId('refused').innerHTML.replaceAll(' open=', ' data-was=')"

@@ -517,7 +517,7 @@ def test_only_a_page_of_the_session_signs_out() -> None:
         browser.post("/sign-out", data={"token": token}, headers={"origin": URL})
         assert status(browser) == 200
     assert browser.get("/sign-out").status_code == 405
-    assert posted(Place().browser(), "/sign-out") == (303, "/")  # nobody was there
+    assert posted(Place().browser(), "/sign-out") == (303, "/")  # no one was signed in
 
 
 def test_everywhere_is_all_of_one_person() -> None:

@@ -16,7 +16,7 @@ from tests import catalogue
 from tests.loops import each
 
 _CARDS = re.compile(rf"\b({'|'.join(Word)})\b")
-"""What stands on the operator's cards is the same in every language."""
+"""The text of the operator's cards is the same in every language."""
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ Clauses, one a line or parted by " ; ". First what there is:
     person name=jo source=page      who has the same source shares a scanner or a page;
                                     mounted: the scanners at the sockets
 
-Then acts with their times. People are honest: an act that nobody honest would do at that moment, or
+Then acts with their times. People are honest: an act that no honest person would do then, or
 for which nothing is there, is skipped, so that any part of a story is a story.
 
     @3.0 put unit=1 socket=A        pull unit=1
@@ -27,7 +27,7 @@ for which nothing is there, is skipped, so that any part of a story is a story.
     @6.0 look                       only time passes
     @7.0 sleep unit=1 seconds=3     the unit neither hears nor sends; its supply stays on
     @7.0 dip socket=A seconds=0.5   the supply of a socket fails
-    @7.0 stall socket=A seconds=1   the process of a socket stands still
+    @7.0 stall socket=A seconds=1   the process of a socket stalls
     @7.0 worker socket=A            it dies
     @7.0 unplug socket=A seconds=1  its adapter is away
     @7.0 station seconds=2          the station dies, and is started again
@@ -60,7 +60,7 @@ Kinds of violations, by what is true when there is none:
 # What is counted
 
 The summary names the steps, stories, scans and runs, how the runs ended, and as "undetectable" the
-exchanges that nobody can detect: those of `undetectable`, and where a target cannot be asked
+exchanges that cannot be detected: those of `undetectable`, and where a target cannot be asked
 (recipes wmc and obc) those between its card and its label, between the first reset of a run and its
 first update command, and after the end of its transfer. Anything else of the kinds above is a
 violation; it is shrunk to a story of one line.

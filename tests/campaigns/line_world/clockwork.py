@@ -208,7 +208,7 @@ class Process:
         return None
 
     def kill(self) -> None:
-        """End it where it stands."""
+        """End it where it is."""
         if not self.is_over:
             self._greenlet.throw()
         self._bus.close_adapter()
@@ -231,7 +231,7 @@ class PaperUnit:
         """The battery where there is one."""
         self.sleeps_until = float("-inf")
         self.gave_up_at = float("-inf")
-        """When a device ended a transfer that nobody continued, and began to announce itself."""
+        """When a device ended a transfer that was not continued, and began to announce itself."""
         self.on_sent: Callable[[float], None] = lambda _now: None
         self.last_word: BootloaderState | None = None
         """State of its `engine` when its last message was received since its power came; None while

@@ -24,7 +24,7 @@ _NUMBERS: Final = {"none": 5, "empty": 2.5, "maker": 4, "own": 2, "other": 1.5}
 _NUMBERLESS: Final = ("empty", "new")
 """Number and application of a unit that runs the line's firmware, and reports no number."""
 _UNTOLD: Final = ("none", "empty")
-"""Numbers of units that nobody can tell from each other while the line writes none."""
+"""Numbers of units that are indistinguishable while the line writes none."""
 _GAPS_S: Final = (HAND_S, 0.3, 0.3, 0.5, 1.0, 3.5)
 """From pulling a unit to putting another one in."""
 _AFTER_FLASH: Final = (StepName.WRITE, StepName.RESTART, StepName.VERIFY)
@@ -95,7 +95,7 @@ class Teller:
                 upcoming.insert(index, (now + gap, following, actor))
 
     def _opening(self) -> Iterator[Step]:
-        """What takes several things at once, while nobody else is at the line."""
+        """What takes several things at once, while no one else is at the line."""
         people = [each.name for each in self.world.setup.people if each.source != "mounted"]
         if people and self.chance.random() < 0.9:
             scenes = [self._scan_at_once, self._lose_station, self._cancel_label]
@@ -135,7 +135,7 @@ class Teller:
         return [each for each in self.world.units if self.world.where(each) is None]
 
     def _fresh(self) -> list[Bay]:
-        """Sockets with a unit that nobody has scanned."""
+        """Sockets with a unit that was not scanned."""
         return [
             bay
             for bay in self._bays(full=True, working=False)
@@ -145,7 +145,7 @@ class Teller:
         ]
 
     def _bring(self, count: int) -> Generator[Step, None, list[Bay]]:
-        """Have so many units in sockets that nobody has scanned, as far as there are."""
+        """Have so many units in sockets that were not scanned, as far as there are."""
         units = [each for each in self._on_table() if label_of(each) not in self.world.passed]
         empty = self._bays(full=False)
         for unit, bay in list(zip(units, empty, strict=False))[
@@ -405,7 +405,7 @@ class Teller:
 
     def _go_on_in_an_outage(self, name: str, *, is_identical: bool = False) -> Iterator[Step]:
         """A socket stops to work after a PASS, and somebody goes on with the next unit there.
-        `is_untold`: with two units that nobody can tell apart, if there are such.
+        `is_untold`: with two indistinguishable units, if there are such.
         """
         bays = yield from self._bring(2)
         if is_identical:
@@ -421,7 +421,7 @@ class Teller:
             if label_of(unit) in self.world.passed:
                 yield self._pause(), None
                 yield from self._outage(bay.name, is_identical=is_identical)
-                yield 12.0, None  # nobody scans the next unit at once
+                yield 12.0, None  # the next unit is not scanned at once
                 return
 
     def _scan_another_number(self, name: str) -> Iterator[Step]:
@@ -456,7 +456,7 @@ class Teller:
         return unit.number in _UNTOLD and unit.application != "none"
 
     def _put_another(self, bay: Bay, *, is_identical: bool = False) -> Iterator[Step]:
-        """`is_untold`: one that cannot be told from it, if there is one."""
+        """`is_untold`: one indistinguishable from it, if there is one."""
         before = self._number(bay)
         yield 0.0, stories.Pull(unit=before)
         on_table = [each for each in self._on_table() if each != before]

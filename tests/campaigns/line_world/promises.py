@@ -157,7 +157,7 @@ class Promises:
                 label,
                 unit,
                 self._number_of(unit),
-                # One that nobody can ask is not identified with an application either; one without
+                # One that cannot be asked is not identified with an application either; one without
                 # power announces its bootloader before anybody can ask its application.
                 (engine.stored_image is not None and engine.has_power)
                 or not engine.target.has_version_query,
@@ -175,7 +175,7 @@ class Promises:
             self._runs[socket].has_commanded = True
 
     def pulled(self, socket: str, unit: PaperUnit, *, was_calm: bool) -> None:
-        """`was_calm`: it was in the socket and heard for some time before the run."""
+        """`was_calm`: it was in the socket and detected for some time before the run."""
         self.touched(socket)
         run = self._runs.get(socket)
         if run is None or run.number is None or run.unit is not unit:

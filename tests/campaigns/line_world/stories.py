@@ -173,7 +173,7 @@ class Dip(Act):
 
 @dataclass(frozen=True, kw_only=True)
 class Stall(Act):
-    """The process of a socket stands still for a time."""
+    """The process of a socket stalls for a time."""
 
     socket: str
     seconds: float = 1.0

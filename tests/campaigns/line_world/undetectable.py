@@ -1,7 +1,7 @@
-"""Exchanges of units that nobody can detect, each with a name of its own.
+"""Exchanges of units that cannot be detected, each with a name of its own.
 
 What follows from one is no violation: it is counted under its name. Each is as narrow as what
-cannot be seen; `docs/how-to/station_run.md` says why ("What nobody can detect").
+cannot be detected; `docs/how-to/station_run.md` says why ("What cannot be detected").
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class Exchanges:
             self._all.append(Exchange(pulled, socket, label, gap_s, is_new, is_alike, is_observed))
 
     def reason_of(self, violation: Violation) -> str:
-        """Why nobody could detect what a violation comes from; empty where somebody could. It comes
+        """Why the cause of a violation was undetectable; empty where it was detectable. It comes
         from the last exchange in its socket of the two units that it names, or from exchanges that
         led from one to the other: all of them have to be undetectable.
         """

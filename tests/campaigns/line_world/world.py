@@ -94,11 +94,11 @@ _READY_S: Final = 3.0
 _RUN_LIMIT_S: Final = 150.0
 _TRIES: Final = 4
 NOTICE_S: Final = 1.0
-"""Before this time nobody has seen what is said of a card that was scanned before."""
+"""Before this time no person has read the answer to a card that was scanned before."""
 STUCK: Final = "STUCK"
-"""The kind of a violation: nobody knows what to scan."""
+"""The kind of a violation: no screen says what to scan."""
 CAREFUL: Final = "careful"
-"""Who brings each unit home; nobody of a story."""
+"""Who brings each unit home; not a person of a story."""
 _SCAN_LABEL: Final = "Scan the label of the unit that is in this socket"
 """A tile says so while its card waits for a label."""
 _FINAL: Final = ("DUPLICATE", "JUST_PASSED", "WRONG_UNIT")
@@ -120,7 +120,7 @@ class Bay:
     changed_at: float = 0.0
     """Since when the same unit is in it, and the station runs."""
     blind_until: float = float("-inf")
-    """Its process stands still, or has no adapter."""
+    """Its process stalls, or has no adapter."""
     unobserved_until: float = float("-inf")
     """The same, when that takes so long that a unit can be exchanged."""
     emptied_at: float = float("-inf")
@@ -150,7 +150,7 @@ class Bay:
     commanded_at: dict[int, float] = field(default_factory=dict)
     """When the run sent each command first."""
     unseen: str = ""
-    """The label that passed with another unit, which nobody could detect."""
+    """The label that passed with another unit, undetectably."""
     heard: dict[str, None] = field(default_factory=dict)
     """Labels of the units that sent something in the run."""
     shown: SocketChanged | None = None
@@ -161,7 +161,7 @@ class Bay:
         return self.shown is not None and self.shown.text.startswith(_SCAN_LABEL)
 
     def blind(self, until: float, seconds: float) -> None:
-        """Nobody observes it until then, for so long."""
+        """It is unobserved until then, for so long."""
         self.blind_until = max(self.blind_until, until)
         if seconds > HAND_S:
             self.unobserved_until = max(self.unobserved_until, until)
@@ -296,7 +296,7 @@ class World:
             self._begin_station()
 
     def _are_level(self) -> bool:
-        """True when no bus is behind the others."""
+        """True when no bus is earlier than the others."""
         return all(bay.bus.clock.now() >= self.now for bay in self.bays.values())
 
     def turn(self) -> None:
@@ -339,7 +339,7 @@ class World:
         try:
             self.station.start()
         except RecordError:
-            # Nothing can be saved: who starts it is told, and tries it again.
+            # Nothing can be saved: the station reports it, and is started again.
             self.station, self._station_at = None, self.now + _AGAIN_S
         else:
             self.promises.restarted(self.now)
@@ -397,7 +397,7 @@ class World:
                         person.label = None
             case RunEnded():
                 self._end(self.bays[event.socket], event)
-            case WorkerFailed() if "said nothing" in event.reason:
+            case WorkerFailed() if "sent nothing" in event.reason:
                 raise Violation("CRASH", f"the process of {event.socket} hangs: {event.reason}")
 
     def _read(self, event: ScanAccepted | ScanRefused | OperatorPrompted) -> None:
@@ -428,7 +428,7 @@ class World:
     # -- acts -------------------------------------------------------------------------------------
 
     def do(self, act: stories.Act) -> bool:
-        """Carry out an act at its time; False where nobody honest would, or nothing is there."""
+        """Carry out an act at its time; False where no honest person would, or nothing is there."""
         self.go_to(stories.time_of(act))
         for person in self.people.values():
             if self.now >= person.notices_at:
@@ -518,7 +518,7 @@ class World:
             sent_at_s=unit.sent_at,
         )
         was_noticed = bay.has_spoken or not bay.is_working or bay.put_at < bay.run_at
-        if was_noticed:  # else the unit before it is the one that the run has heard
+        if was_noticed:  # else the run received the unit before it
             self.exchanges.pull(bay.name, pulled)
         bay.bus.pull(unit)
         unit.on_sent = lambda _now: None
@@ -800,7 +800,7 @@ class World:
         if run.code == "UNIT_CHANGED" and _is_calm(bay) and not _has_given_up(bay, self.now):
             raise Violation(
                 "ACCUSED",
-                f"{event.serial} in {bay.name} was touched by nobody, and is said to be another"
+                f"{event.serial} in {bay.name} was not touched, and is reported as another"
                 f" unit: {run.text}",
             )
         if run.state is not RunState.PASS:
@@ -814,7 +814,7 @@ class World:
         if heard != [event.serial]:
             raise Violation(
                 "FALSE PASS",
-                f"PASS of {event.serial} in {bay.name}, and in its run {_words(heard)} was heard",
+                f"PASS of {event.serial} in {bay.name}, and its run received {_words(heard)}",
                 bay.name,
             )
         unit = next(each for each in self.units.values() if each.label == event.serial)
@@ -827,8 +827,8 @@ class World:
             )
 
     def _unseen(self, bay: Bay) -> str:
-        """How a unit was exchanged so that nobody could detect it; empty where it could be. What
-        tells nothing of itself only announces itself, when its power comes and when it restarts.
+        """How a unit was exchanged undetectably; empty where it could be detected. A unit without
+        an identity only announces itself, when its power comes and when it restarts.
         """
         if self.setup.line.tells:
             return ""
@@ -888,7 +888,7 @@ class World:
                 f" {self.now - bay.changed_at:.1f} s",
             )
 
-    # -- nobody is stuck --------------------------------------------------------------------------
+    # -- no unit is stuck -------------------------------------------------------------------------
 
     def way_home(self) -> Iterator[stories.Act]:
         """Nothing else happens any more, and a careful person brings each unit to a finished run:
@@ -1029,7 +1029,7 @@ def _make(setup: stories.UnitSetup, none: str, line: stories.LineSetup) -> Paper
 
 
 def _is_calm(bay: Bay) -> bool:
-    """Nobody had touched anything for some time before the run."""
+    """Nothing was touched for some time before the run."""
     return bay.disturbed_at < bay.run_at - CALM_S
 
 
@@ -1063,7 +1063,7 @@ def _looks(moment: float) -> list[float]:
 
 
 def _words(labels: list[str]) -> str:
-    return " and ".join(labels) or "nobody"
+    return " and ".join(labels) or "no unit"
 
 
 def _shown(event: StationEvent) -> str:

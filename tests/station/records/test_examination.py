@@ -55,7 +55,7 @@ def test_only_what_came_after_the_last_examination_is_examined(examined: Bench) 
     assert not found.problems
     assert found.since is not None
     assert [(each.first, each.last, each.rows) for each in found.kept] == [(1, 9, 9)]
-    assert seen[0] == (0, 5)  # the bar stands before the first row
+    assert seen[0] == (0, 5)  # the bar is there before the first row
     assert seen[-1] == (5, 5)  # three audit rows and two runs
     examined.store.finish(running, examined.ending(trace=examined.traced("W2605005")))
     again = go_on(examined)

@@ -1,5 +1,5 @@
 """Records changed by somebody with a database tool, time and knowledge, who puts every rule back
-afterwards: each change is told by what it is.
+afterwards: `verify` names each change.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ def test_a_backup_made_while_a_unit_runs_is_whole_and_opens_by_itself(bench: Ben
     assert not list(bench.folder.glob(".*part*"))
     bench.make(RunState.PASS, "W2605004", "B")
     key_locations = KeyLocations(
-        bench.folder / "of nobody"
+        bench.folder / "of no one"
     )  # the kept heads know the later run as well
     with Store.open(str(path), station="line-2", create=False, key_locations=key_locations) as copy:
         assert not copy.examine().problems

@@ -1,5 +1,4 @@
-"""What an upgrade says of itself while it runs and when it has ended: where it stands, what it
-counted, what came where it had no place."""
+"""Reports of an upgrade, while it runs and at its end: progress, counts, unexpected messages."""
 
 from __future__ import annotations
 
@@ -44,7 +43,7 @@ def reported(bench: Bench) -> list[str]:
     return [event.what for event in bench.events if isinstance(event, events.Reported)]
 
 
-# -- where it stands ------------------------------------------------------------------------------
+# -- progress --------------------------------------------------------------------------------------
 
 
 def test_it_states_where_it_is_with_packet_and_attempt() -> None:
@@ -299,7 +298,7 @@ def test_a_bootloader_that_names_no_version_is_refused_where_one_is_asked_for() 
     options = UpgradeOptions(minimum_boot_version="V1.0.0", allow_boot_name=True)
     bench = Bench(options=options)
     bench.to_boot()
-    bench.say(BootVersion("BMS", "nobody"))
+    bench.say(BootVersion("BMS", "none"))
     assert bench.outcome.ending is Ending.BOOT_TOO_OLD
 
 
@@ -343,7 +342,7 @@ def test_at_the_deadline_it_ends_as_the_attempt_before_would_have(
 
 
 def test_a_session_that_was_not_to_be_checked_names_the_check_that_refused() -> None:
-    rule = CheckResult(IdentityCheck.HARDWARE, CheckVerdict.REFUSED, "no hardware told")
+    rule = CheckResult(IdentityCheck.HARDWARE, CheckVerdict.REFUSED, "no hardware reported")
     bench = Bench(options=replace(ONCE, in_session=True))
     stage(bench).unchecked = rule
     bench.expect(ResetCommand)
