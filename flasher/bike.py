@@ -1,4 +1,4 @@
-"""Whole bike: a set of images by target, the order of its upgrades, and the checks before them.
+"""Upgrade of a whole bike: images by target, the order of the upgrades, and the checks before them.
 
 The documents give one device that supplies the others, and that reports its version and its charge:
 the battery. So a device without an application comes first, the battery before the others, and of

@@ -1,4 +1,4 @@
-"""How this flasher was packed: for pip, or whole, with its packages, as one file or a folder."""
+"""Kind of this build: installed by pip, or packed with all packages, as one file or a folder."""
 
 from __future__ import annotations
 

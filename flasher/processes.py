@@ -1,6 +1,4 @@
-"""Processes that flasher starts: block their signals, and end them with the process that started
-them.
-"""
+"""Child processes: blocked signals, and an end with the process that started them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""python-can without asammdf, whose import takes 0.5 s and is needed for .mf4 files only."""
+"""Import of python-can without asammdf, which takes 0.5 s and is needed for .mf4 files only."""
 
 from __future__ import annotations
 

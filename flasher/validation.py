@@ -1,5 +1,4 @@
-"""Type annotations that validate (number ranges, parsed texts, enumerations), and JSON keys of
-dataclasses.
+"""Validating type annotations (number ranges, parsed texts, enumerations), and JSON keys.
 
 `Annotated[int, NumberRange(ge=1, le=100)]`, `Annotated[str, Parsed("64 hex digits", read_sha256)]`.
 Only modules that read or write files need the validation library.

@@ -1,4 +1,4 @@
-"""Images on this computer by the firmware version inside: the way back from an upgrade.
+"""Index of the images on this computer by firmware version, to undo an upgrade.
 
 Files are searched for the text of a version, not loaded: that takes milliseconds for a file. An
 image that is flashed later is checked like any other.

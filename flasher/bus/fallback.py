@@ -1,4 +1,4 @@
-"""Adapter settings of a settings file, used where option, variable and python-can give none."""
+"""Adapter settings of a settings file, for what options, variables and python-can leave open."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""State of a SocketCAN interface on Linux, read without root, and commands to set one up.
+"""SocketCAN interface on Linux: its state, read without root, and commands to set it up.
 
 Uses `ip -details -json link show`; if that is missing or too old, /sys shows whether the interface
 exists and is up.

@@ -1,4 +1,4 @@
-"""Opens a python-can bus: merged configuration, and errors with cause and remedy."""
+"""Opening of a python-can bus: merged configuration, and errors with cause and remedy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Distinguishes physical CAN adapters from virtual buses."""
+"""Classification of python-can interfaces: physical CAN adapter or virtual bus."""
 
 from __future__ import annotations
 

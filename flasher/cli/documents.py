@@ -1,4 +1,4 @@
-"""Documents of `--json`: their types, and what they are made of.
+"""Documents of `--json`: registry of their types, and types that several of them contain.
 
 A type that a command prints is printed as it is, or with the keys of
 `flasher.validation.json_keys`. Only a view that differs from it is a document, a frozen dataclass

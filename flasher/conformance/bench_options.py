@@ -1,5 +1,6 @@
-"""Options of a bench, and `open_bench`, which opens the device under test and its profile. Used by
-the command line and the pytest plugin.
+"""Options of a bench, and `open_bench`, which opens the device under test and its profile.
+
+Used by the command line and the pytest plugin.
 """
 
 from __future__ import annotations

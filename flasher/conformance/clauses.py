@@ -1,5 +1,7 @@
-"""Clauses that the cases refer to, in this project's words: the vendor document's, by its own
-numbers, and this project's readings R1 to R28 of what the document leaves open.
+"""Clauses that the cases refer to, in this project's words.
+
+Those of the vendor's document have its own numbers; the readings R1 to R28 are this project's, of
+what the document leaves open.
 """
 
 from __future__ import annotations

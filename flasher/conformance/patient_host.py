@@ -1,6 +1,7 @@
-"""Reference host of the suite, independent of flasher's own: upgrades the device from any state,
-repeats lost messages and reports the result without judging it. Also detects whether an application
-runs.
+"""Reference host of the suite, independent of flasher's own.
+
+Upgrades the device from any state, repeats lost messages and reports the result without judging it.
+Also detects whether an application runs.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Hooks and fixtures of the pytest plugin `pytest_flasher` that are loaded only when a device is
-given: the run on the device, the bench of each test, the collection of the suite.
+"""Pytest plugin, as far as it is loaded only when a device is given (see `pytest_flasher`).
+
+The run on the device, the bench of each test, the collection of the suite.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The product's documented choices, limits and deviations, as the suite judges by them.
+"""Conformance profile: documented choices, limits and deviations of a product.
 
 A profile is a TOML file; every key has a default, and may carry a rationale:
 

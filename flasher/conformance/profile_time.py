@@ -1,6 +1,4 @@
-"""A time that is computed from limits of a profile, and that knows them: a failure that it decides
-names them.
-"""
+"""Time computed from limits of a profile, which it keeps, so that a failure can name them."""
 
 from __future__ import annotations
 

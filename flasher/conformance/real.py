@@ -1,5 +1,6 @@
-"""Subject for a device on a real bus: any link, power by a command or function, readback by a
-command that dumps the flash to a file.
+"""Subject for a device on a real bus.
+
+Any link; power by a command or function; readback by a command that dumps the flash to a file.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""Reports of a run for programs: JSON, JUnit XML for CI servers, and trace files of cases as
-candump logs, which `flasher explain` and python-can read.
-"""
+"""Reports of a run for programs: JSON, JUnit XML, and candump logs of cases."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Port and base class of subjects on a simulated bus with a virtual clock, which provides exact end
-times of all frames.
-"""
+"""Base class and port of subjects on a simulated bus, with exact end times of all frames."""
 
 from __future__ import annotations
 

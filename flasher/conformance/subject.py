@@ -1,5 +1,6 @@
-"""Interfaces of the device under test (`Subject`) and of its bus (`BusPort`); implemented by
-`mock`, `real` and `dut`.
+"""Interfaces of the device under test (`Subject`) and of its bus (`BusPort`).
+
+Implemented by `mock`, `real` and `dut`.
 """
 
 from __future__ import annotations

@@ -1,5 +1,7 @@
-"""Value names shared by all exports: `running_information.voltage_mv` is the filter
-`welling.running_information.voltage_mv` in Wireshark, a column and a signal elsewhere.
+"""Value names shared by all exports.
+
+`running_information.voltage_mv` is the filter `welling.running_information.voltage_mv` in
+Wireshark, a column and a signal elsewhere.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Bus guard: detects a second tool, and SHUTDOWN of the battery, during an upgrade session; pure.
+"""Bus guard: detects a second tool, and the battery's SHUTDOWN, during an upgrade session; pure.
 
 A second tool sends with the CAN id of the tool. Queries (mode 11) are distinguished from other
 messages, because they write nothing. SHUTDOWN switches off the supply of every target.

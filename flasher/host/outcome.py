@@ -1,4 +1,4 @@
-"""Outcome of an upgrade: its ending, the state of the device, statistics, and the error to raise.
+"""Outcome of an upgrade: ending, state of the device, statistics, and the error to raise.
 
 Three claims are distinct: "transferred" (every packet acknowledged), "completed" (confirmed by the
 device), and "running version X" (answered by the new application).

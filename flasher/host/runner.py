@@ -1,4 +1,4 @@
-"""Runner: executes a dialogue with a device, written as generators, as one protocol engine; pure.
+"""Runner: a protocol engine that runs a dialogue with a device, written as generators; pure.
 
 A stage is a generator. It yields the time until which it waits (None: indefinitely), and receives
 the next input:

@@ -1,4 +1,4 @@
-"""Reads what each station of a plant has done lately: yield of shift and day, and last runs."""
+"""Reads the recent activity of each station of a plant: yield of shift and day, and last runs."""
 
 from __future__ import annotations
 

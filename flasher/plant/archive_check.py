@@ -1,4 +1,4 @@
-"""Examines a file of retired records: audit trails, signatures, runs, traces, and what was kept."""
+"""Examines a file of retired records: audit trails, signatures, runs, traces, kept rows."""
 
 from __future__ import annotations
 

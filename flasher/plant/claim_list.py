@@ -1,6 +1,5 @@
 # ruff: noqa: S608  all of this SQL is written here
-"""Lists the claims of units in a plant's database, and releases those of a station that does not
-return.
+"""Lists the claims of units in a plant's database, and releases those of a lost station.
 
 A claim that expired stays until its station sends the end of the run: until then the unit may have
 passed there, and other stations mark it or refuse it. A released claim holds nothing up. If its

@@ -1,5 +1,5 @@
 # ruff: noqa: S608  all of this SQL is written here
-"""Deliveries of runs to receivers in the plant's database: what is open, and what became of it."""
+"""Deliveries of runs to receivers in the plant's database: open ones, and their results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fetches the recipes that the plant gives to a station, and what it has withdrawn.
+"""Fetches a station's recipes and withdrawals from the plant's database.
 
 A part of the process that sends: units never wait for it. A recipe is in the station's folder as a
 whole or not at all, with the content that its digest states; a full disk or a lost connection

@@ -1,4 +1,4 @@
-"""Sends a document to a receiver, by HTTP or MQTT 5, and returns what is known afterwards.
+"""Sends a document to a receiver, by HTTP or MQTT 5, and returns the result.
 
 What is known is not always what happened: without an answer the receiver may have the document or
 not (`UNKNOWN`). It is sent again then, with the same key.

@@ -1,4 +1,4 @@
-"""Building a release: images with their manifests, packed with all that verifying needs."""
+"""Release builder: packs images with their manifests and all that verification needs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Places of the trust file, and the mark of a release: all that an upgrade without either needs."""
+"""Paths of trust files and of releases: all that an upgrade without either needs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Statement of a release: what its signatures are about (in-toto Statement v1).
+"""Statement of a release: the content that is signed (in-toto Statement v1).
 
 Subjects are the files of the release, and the bytes to be sent of each image (`bms:sent`). The
 predicate has the manifest of each image, with its product and counter.

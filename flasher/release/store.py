@@ -1,4 +1,4 @@
-"""What this computer trusts, and the newest that it has seen of it.
+"""Trust store: the trust file of this computer, and the newest version seen of it.
 
 The trust file is in the system's or the user's configuration: `trust.toml` to read, and
 `trust.json` with all its versions and their signatures. A newer version that a release brings is

@@ -1,4 +1,4 @@
-"""Plans that are kept: for places that random plans seldom reach, and for the planted mistakes."""
+"""Stored plans: for places that random plans seldom reach, and for the planted mistakes."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Records what a campaign has reached: rows of the tables, faults in each phase, exit codes, and
-readings of the documents (R1 to R28).
+"""Coverage of a campaign: rows of the tables, faults in each phase, exit codes, readings R1 to R28.
 
 What no run of a large campaign reaches is not tested by it. So the places that there are (`places`)
 are compared with those that were reached; `UNREACHABLE` names the ones that nothing can reach. What

@@ -1,6 +1,4 @@
-"""Campaigns of random walks (`flasher conformance explore`), each by a seed of its own on a new
-device.
-"""
+"""Campaigns of random walks (`flasher conformance explore`): one seed and a new device for each."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Finds the adapters of a station's sockets by serial number or USB path, and creates the settings
-of the sockets' processes.
+"""Finds the adapters of a station's sockets by serial number or USB path.
+
+Creates the settings of the sockets' processes.
 
 `detect` lists the connected adapters (see `flasher.bus.detect`), and `resolve` assigns them.
 """

@@ -1,5 +1,4 @@
-"""Detects that the unit in a socket may have been exchanged, or lost power, since it was
-identified.
+"""Detects that the unit in a socket may have been exchanged or lost power since identification.
 
 A `Continuity` is a driver's tap for one target of a run; it does no I/O. `lost` is the evidence:
 

@@ -1,5 +1,4 @@
-"""Recipes that the plant gives out: what they consist of, the folder that keeps them, and which
-ones a supervisor of the station has approved.
+"""Recipes from the plant: their files, the folder that stores them, and their approval.
 
 A recipe is given with its files as a *bundle*. Its digest is the SHA-256 of its manifest, which
 names each file with its SHA-256. The process of `flasher.plant` writes the folder, whole bundles

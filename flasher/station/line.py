@@ -1,5 +1,4 @@
-"""Logic of a station without I/O: assigns labels to sockets, starts runs, and sets what sockets
-show.
+"""Logic of a station without I/O: assigns labels to sockets, starts runs, sets their displays.
 
     scans, presence of units, messages of the sockets' processes, results of saving, the time
         -> Line ->

@@ -1,6 +1,4 @@
-"""Signed content of a certificate: the content of its run, the audit row with its digests, and the
-station's signature.
-"""
+"""Signed content of a certificate: its run, the audit row with digests, the station's signature."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Explains recorded bus traces of runs."""
+"""Explanations of the recorded bus traces of runs."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Reader of .mf4 measurement files, in a process of its own: the library for the format is written
-in C, and some damaged files end the process that reads them.
+"""Reader of .mf4 measurement files, in a process of its own.
+
+The library for the format is written in C, and some damaged files crash the process.
 
 `python -m flasher.trace.mf4` is that process. It writes the frames of the file on its standard
 input to its standard output.

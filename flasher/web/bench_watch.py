@@ -1,4 +1,4 @@
-"""Bus view of the bench: its messages as they come."""
+"""Bus view of the bench: live list of messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sends states to pages: each message is the whole state of one subject.
+"""Event stream to pages: each message is the whole state of one subject.
 
 A program's thread calls `put` and `beat`; pages follow in the server's event loop. A new page
 receives all states, then each change in order. A newer state replaces an unsent one of its subject

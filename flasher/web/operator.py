@@ -1,5 +1,4 @@
-"""Operator page: a tile for each socket, a header, a footer, and an overlay for a stopped line or a
-silent station.
+"""Operator page: tiles of the sockets, header, footer, overlay of a stopped or silent station.
 
 `Screen` receives the station's events in the station's thread; the page follows its `Feed`.
 """

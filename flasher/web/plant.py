@@ -1,6 +1,4 @@
-"""Supervisor pages of a plant: those of a station over all stations, and the pages of stations and
-of deliveries.
-"""
+"""Supervisor pages of a plant: a station's pages over all stations, stations, deliveries."""
 
 from __future__ import annotations
 

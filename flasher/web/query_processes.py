@@ -1,5 +1,4 @@
-"""Processes that render pages from the records, so that the station that serves them is not
-delayed.
+"""Processes that render pages from the records, so that the station is not delayed.
 
 Questions and answers are plain data. The processes start with the first question.
 """

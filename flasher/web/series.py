@@ -1,4 +1,4 @@
-"""Series: the bench takes one bike after the other by itself, with the image of the last upgrade.
+"""Series mode of the bench: one bike after the other, with the image of the last upgrade.
 
 It waits until the upgraded unit is taken out and another one is connected, shows for some seconds
 which unit gets which image, and upgrades it with all checks. It asks before it upgrades a unit that

@@ -1,4 +1,4 @@
-"""Unit watch: engine that follows which unit is connected to the bench, and when it is exchanged.
+"""Unit watch: engine that detects which unit is connected to the bench, and its exchange.
 
 It requests the version twice a second, like an idle socket of the station (`Presence`). As a tap it
 follows the frames of other engines too.

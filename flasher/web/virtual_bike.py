@@ -1,4 +1,4 @@
-"""Virtual bikes for the bench page, each with one fault or none, or exchanged after an upgrade."""
+"""Virtual bikes of the bench page, each with at most one fault, or exchanged after an upgrade."""
 
 from __future__ import annotations
 

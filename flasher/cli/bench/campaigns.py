@@ -1,6 +1,4 @@
-"""Campaigns of runs from seeds: options, progress and sums, as `flasher simulate` and `flasher
-conformance explore` have them.
-"""
+"""Options, progress and totals of campaigns: `flasher simulate`, `flasher conformance explore`."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""`flasher conformance`: test a bootloader against the protocol, compare runs, document the
-profile.
-"""
+"""`flasher conformance`: test a bootloader against the protocol, compare runs, print a profile."""
 
 from __future__ import annotations
 

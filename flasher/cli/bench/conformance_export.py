@@ -1,4 +1,4 @@
-"""`--export-test`: what failed as a unit test in C."""
+"""`--export-test`: writes the first failure as a unit test in C."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Formats the output of `flasher conformance`: summary of a run, comparison of two, list of
-cases.
-"""
+"""Text output of `flasher conformance`: summary of a run, comparison of two, list of cases."""
 
 from __future__ import annotations
 

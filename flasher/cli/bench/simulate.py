@@ -1,4 +1,4 @@
-"""`flasher simulate`: random upgrades with faults, judged by what is in the devices' flash."""
+"""`flasher simulate`: random upgrades with faults, judged by the flash memory of the devices."""
 
 from __future__ import annotations
 

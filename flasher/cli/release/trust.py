@@ -1,4 +1,4 @@
-"""`flasher trust`: which keys may sign releases, and whose releases this computer takes."""
+"""`flasher trust`: choose the keys that may sign releases, and whose releases are flashed here."""
 
 from __future__ import annotations
 

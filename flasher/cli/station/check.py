@@ -1,4 +1,4 @@
-"""`flasher station check`: checks a recipe, its images and a station file before a shift."""
+"""`flasher station check`: check a recipe, its images and a station file before a shift."""
 
 from __future__ import annotations
 

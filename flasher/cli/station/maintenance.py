@@ -1,4 +1,4 @@
-"""`flasher station backup`, `verify`, `key`, `accept`, `upgrade`: maintains records."""
+"""`flasher station backup`, `verify`, `key`, `accept`, `upgrade`: maintain the records."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`flasher station run`: runs a station and shows its events."""
+"""`flasher station run`: run a station and show its events."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""`flasher ui`: upgrade one bike in a browser, by the page of `flasher.web.bench`. Its packages
-(the extra `web`) are imported only here.
+"""`flasher ui`: upgrade one bike in a browser, on the page of `flasher.web.bench`.
+
+Its packages (the extra `web`) are imported only here.
 """
 
 from __future__ import annotations

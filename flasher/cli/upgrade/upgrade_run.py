@@ -1,5 +1,6 @@
-"""Upgrade run with recording: frames, a bundle if it fails, and this computer's history. A failure
-to record does not affect the upgrade: it only prints a warning.
+"""Upgrade run with recording: frames, a bundle if it fails, and this computer's history.
+
+A failure to record does not affect the upgrade: it only prints a warning.
 """
 
 from __future__ import annotations

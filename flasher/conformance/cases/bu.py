@@ -1,5 +1,7 @@
-"""BU: bus faults. Frames are lost, doubled, delayed and swapped one at a time; the device goes
-bus-off; another node uses the device's id.
+"""BU: bus faults.
+
+Frames are lost, doubled, delayed and swapped one at a time; the device goes bus-off; another node
+uses the device's id.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Transfers that are never ended, for cases about framing, checksum and gaps. Whether the next
-packet is acknowledged shows how the device handled the preceding bytes.
+"""Transfers that are never ended, for cases about framing, checksum and gaps.
+
+Whether the next packet is acknowledged shows how the device handled the preceding bytes.
 """
 
 from __future__ import annotations

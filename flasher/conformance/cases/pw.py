@@ -1,5 +1,6 @@
-"""PW: power cuts, and flash memory that fails. The device stays reachable all the same, and never
-starts a mixture of two images.
+"""PW: power cuts, and flash memory that fails.
+
+The device stays reachable all the same, and never starts a mixture of two images.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""SP: speed. Runs only when selected by name, as it wears the flash. Measures the times of TM-05
-often enough to compare their distribution between two reports.
+"""SP: speed. Runs only when selected by name, as it wears the flash.
+
+Measures the times of TM-05 often enough to compare their distribution between two reports.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""TX: transfer. Damaged and repeated packets, wrong packet headers, the largest image, and pauses
-and resets during a transfer.
-"""
+"""TX: transfer. Damaged or repeated packets, wrong headers, the largest image, pauses, resets."""
 
 from __future__ import annotations
 

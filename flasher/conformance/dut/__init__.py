@@ -1,4 +1,4 @@
-"""Device under test that is a bootloader compiled for this computer or written in Python.
+"""Bootloader under test that is compiled for this computer or written in Python.
 
 `flasher_dut.h` documents the interface; `flasher_dut_process.c` makes a program of a bootloader in
 C that implements it. This module is the same interface for Python: `--subject MODULE:FACTORY` names

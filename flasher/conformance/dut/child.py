@@ -1,5 +1,6 @@
-"""Main program of the process of a bootloader that is a shared library or Python code, and of the
-spawner, which forks it; the counterpart of `flasher_dut_process.c`.
+"""Process of a bootloader that is a shared library or Python code, and the spawner that forks it.
+
+The counterpart of `flasher_dut_process.c`.
 """
 
 from __future__ import annotations

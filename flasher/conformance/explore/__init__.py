@@ -1,4 +1,4 @@
-"""Random walks on a device until one finds a violation, then shrink it to the fewest steps."""
+"""Random walks on a device until one finds a violation, which is shrunk to the fewest steps."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Session of one question of `init`: a transfer of the good image that can always be completed, so
-that the device runs again without leaving the transfer.
+"""Session of one question of `init`: a transfer of the good image that can always be completed.
+
+So the device runs again without leaving the transfer.
 """
 
 from __future__ import annotations

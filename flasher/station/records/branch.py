@@ -1,5 +1,6 @@
-"""Brings a branch into the records of a station: what another PC with a copy of them recorded after
-they had been taken over.
+"""Merges a branch into the records of a station.
+
+A branch is what another PC with a copy of the records recorded after they had been taken over.
 
 Each row of the branch becomes a row of the station's audit trail that holds the signed original;
 runs keep their numbers, which the station left free (`RUNS_LEFT_FREE`).

@@ -1,5 +1,6 @@
-"""Claims a unit for a run: checks every rule in the transaction that starts the run, so that two
-sockets cannot both take the last place of a lot.
+"""Claims a unit for a run: checks every rule in the transaction that starts the run.
+
+So two sockets cannot both take the last place of a lot.
 """
 
 from __future__ import annotations

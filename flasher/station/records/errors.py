@@ -1,5 +1,4 @@
-"""Errors of reading and writing records, and their mapping from errors of SQLite, PostgreSQL and
-the disk.
+"""Errors of records, mapped from those of SQLite, PostgreSQL and the disk.
 
 After a `RecordError` of a write, nothing was saved and PASS must not be shown.
 """

@@ -1,4 +1,4 @@
-"""State of the last examination, so that the next one continues after it.
+"""State of the last examination of the records, after which the next one continues.
 
 It is stored in a file beside the examiner's keys, signed with a key of the examiner.
 """

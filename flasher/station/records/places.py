@@ -1,6 +1,4 @@
-"""Stores chain heads in folders and on PostgreSQL servers; a background thread copies them
-there.
-"""
+"""Copies chain heads to folders and PostgreSQL servers, in a background thread."""
 
 from __future__ import annotations
 
