@@ -298,7 +298,7 @@ def test_a_bootloader_that_names_no_version_is_refused_where_one_is_asked_for() 
     options = UpgradeOptions(minimum_boot_version="V1.0.0", allow_boot_name=True)
     bench = Bench(options=options)
     bench.to_boot()
-    bench.say(BootVersion("BMS", "none"))
+    bench.say(BootVersion("BMS", "absent"))
     assert bench.outcome.ending is Ending.BOOT_TOO_OLD
 
 
