@@ -263,7 +263,7 @@ def _output_options() -> list[click.Parameter]:
             "-v", "--verbose", multiple=True,
             help="print more, and show the log on stderr; twice for everything",
         ),
-        _output_option("-q", "--quiet", multiple=True, help="say less"),
+        _output_option("-q", "--quiet", multiple=True, help="print less"),
         _output_option(
             "--json", brief=True, help="print one JSON document (or JSON lines) on stdout"
         ),
@@ -276,7 +276,7 @@ def _output_options() -> list[click.Parameter]:
         ),
         _output_option(
             "-h", "brief_help", callback=_show, is_eager=True, brief=True,
-            help="show what is needed most",
+            help="show the most used options",
         ),
         _output_option(
             "--help", callback=_show, is_eager=True, brief=True,

@@ -119,7 +119,7 @@ PURPOSES: Final[Mapping[str, Mapping[str, CommandEntry]]] = {
             "plant.commands:plant", "collect the records of all stations of a plant"
         ),
     },
-    "what a product does its own way": {
+    "settings of a product": {
         "profile": CommandEntry(
             "upgrade.profile:profile",
             "show the settings of a target, and where each comes from",

@@ -116,7 +116,7 @@ class DeviceProfile:
     older_battery: Literal["no", "yes"] = "no"
     """Yes: no state of health, no answer to 732 5300 and 742 5200 (section 6)."""
     silent_queries: str = "none"
-    """Commands not answered, as 3800,732:5000: of all ids, or of one; parted by commas."""
+    """Commands not answered, as 3800,732:5000: of all ids, or of one; separated by commas."""
     battery_use: Literal["riding", "resting"] = "resting"
     """Rides and charges in turn, or rests: a vehicle in use is not upgraded."""
     battery_seed: Number = 1

@@ -209,7 +209,7 @@ def _fill(url: str, runs: int) -> None:
 
 
 def _send(url: str, runs: int) -> None:
-    """Send runs of a station with new records over the product's own way."""
+    """Send runs of a station with new records, by the product's own sender."""
     role = role_of("line-2")
     setup(url, ["line-2"], datetime.now(UTC), renewed=["line-2"])
     with psycopg.connect(url, autocommit=True) as admin:

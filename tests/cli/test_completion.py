@@ -236,7 +236,7 @@ def test_help_lists_the_commands_by_purpose(flasher: Flasher) -> None:
         "when something goes wrong",
         "without hardware, and for bootloaders",
         "at the end of a production line",
-        "what a product does its own way",
+        "settings of a product",
     ):
         assert f"\n{title}:\n" in reported
     for name, entry in COMMANDS.items():

@@ -1,4 +1,4 @@
-"""`flasher flash --profile`: what a product does its own way decides what is sent and accepted."""
+"""`flasher flash --profile`: the product's settings decide what is sent and accepted."""
 
 from __future__ import annotations
 

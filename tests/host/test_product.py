@@ -1,4 +1,4 @@
-"""What a product does its own way: its reset (R3), its version query."""
+"""Settings of a product: its own reset (R3), its own version query."""
 
 from __future__ import annotations
 

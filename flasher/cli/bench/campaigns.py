@@ -63,11 +63,11 @@ class CampaignOptions:
     )]  # fmt: skip
     shard: Annotated[tuple[int, int] | None, what_option(
         "--shard", type=_shard, metavar="I/N",
-        help="run the part I of N parts, as in a job array; `simulate merge` adds them up",
+        help="run part I of N, as in a job array; `simulate merge` adds them up",
     )]  # fmt: skip
     ledger: Annotated[Path | None, what_option(
         "--ledger", type=values.FilePath("jsonl", gives=Path), metavar="FILE",
-        help="save what is done in this file, and go on with what it lacks",
+        help="save finished runs in this file, and run those that it lacks",
     )]  # fmt: skip
     keep_going: Annotated[bool, what_option(
         "--keep-going", is_flag=True, help="do not end at the first violation",

@@ -104,8 +104,8 @@ examples:
   flasher conformance -t bms --subject ./boot
 
 Without power control the device is brought back by the protocol, and cases that cut the power are
-reported as unsupported. Ctrl-C ends the run with a report of what was run, and puts the good image
-back; a second one ends at once.
+reported as unsupported. Ctrl-C ends the run with a report of the finished cases, and flashes the
+good image; a second one ends at once.
 """
 _TRACE_DIR: Final = "--trace-dir"
 _FILES: Final = {

@@ -115,7 +115,7 @@ bench_options: Final = option_set(
     ),
     _without_hardware(
         "--variant", metavar="NAME",
-        help="a faulty one, see `flasher mock --list-variants`",
+        help="test a faulty model, see `flasher mock --list-variants`",
     ),
     set_option,
 )  # fmt: skip

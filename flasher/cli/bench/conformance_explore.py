@@ -78,7 +78,7 @@ DOCUMENTS: Final = (ExploreResult,)
 
 
 @command(
-    short_help="Walk through messages of all kinds until something is found",
+    short_help="Send messages of all kinds, valid or not, until one shows a violation",
     epilog=_EXAMPLES,
     exit_codes=(ExitCode.IMAGE, ExitCode.BUS, ExitCode.PARTIAL, ExitCode.INTERRUPTED),
 )

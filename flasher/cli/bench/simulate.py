@@ -296,7 +296,7 @@ def _check_device(plan: Plan, subject: str | None) -> None:
 )
 @_html
 def merge(output: Output, *, files: tuple[Path, ...], html: Path | None) -> int:
-    """Add the ledgers of a campaign up: of its shards, or of several sessions."""
+    """Add up the ledgers of a campaign: of its shards, or of several sessions."""
     check_writable(html, "--html", files)
     merged = merge_ledgers(files)
     for notice in merged.notices:

@@ -31,8 +31,8 @@ examples:
   flasher adapters --udev | sudo tee /etc/udev/rules.d/60-flasher.rules
   flasher adapters --json | jq -r '.adapters[].arguments | join(" ")'
 
-Opens no adapter and no serial port. Where one adapter alone is found, commands that only look use
-it by themselves; flash and write do so after receiving the device on it.
+Opens no adapter and no serial port. If it finds only one adapter, commands that only read use it
+by themselves; flash and write do so after receiving the device on it.
 """
 
 

@@ -177,7 +177,7 @@ def _protocol_file(output: Output, file: Path | None, text: str, *, encoding: st
 @_output_file("the DBC (default: standard output)", "dbc")
 def dbc(output: Output, *, file: Path | None) -> int:
     """Write a DBC, for SavvyCAN, CANalyzer, cantools and the like: the messages as far as a DBC can
-    say them.
+    describe them.
     """
     from flasher.export.dbc import dbc as make  # noqa: PLC0415  loads python-can
 

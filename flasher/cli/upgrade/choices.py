@@ -98,7 +98,7 @@ class UpgradeChoices:
     )]  # fmt: skip
     no_keep_settings: Annotated[bool, option(
         "--no-keep-settings", is_flag=True, panel="upgrade",
-        help="do not, whatever the profile has",
+        help="do not, whatever the profile sets",
     )]  # fmt: skip
     in_session: Annotated[bool, option(
         "--in-session", is_flag=True, panel="upgrade",

@@ -82,9 +82,9 @@ examples:
   flasher rescue firmware.hex -t bms --mock             try it without hardware
 
 Start it, then disconnect the device's supply for some seconds and connect it again. It works for a
-device that announces itself at power-up only as well as for one that announces itself for ever.
-Nothing is sent before the device announces itself, unless an upgrade of it has no end: a device
-that is still in its transfer is found without a power cycle, which is requested only after that.
+device that announces itself only at power-up, and for one that never stops announcing itself.
+Nothing is sent before the device announces itself, unless the history has an upgrade of it without
+an end: a device still in its transfer is found first, without a power cycle.
 Hardware and running version cannot be checked, since no application runs.
 """
 

@@ -21,7 +21,7 @@ examples:
   flasher profile show -t mc --profile bench.toml
   flasher profile check bench.toml
 
-Without --profile, {FILE_NAME} of the working directory holds, else the one of the user's
+Without --profile, {FILE_NAME} of the working directory is used, else that of the user's
 configuration directory. Values before the first table are for every device, a table such as [wmc]
 is for one:
 
@@ -36,8 +36,8 @@ is for one:
   start = 0x08004000
   size_bytes = 0x1C000
 
-The table [bus] of the same file names the adapter for commands that are given none: no option, no
-CAN_* variable, no configuration file of python-can:
+The table [bus] of the same file names the adapter, where no option, no CAN_* variable and no
+configuration file of python-can does:
 
   [bus]
   interface = "pcan"
