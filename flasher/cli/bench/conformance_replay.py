@@ -35,7 +35,10 @@ DOCUMENTS: Final = (ReplayResult,)
     epilog=_EXAMPLES,
     exit_codes=(ExitCode.IMAGE, ExitCode.BUS, ExitCode.PARTIAL, ExitCode.INTERRUPTED),
 )
-@argument("trace", type=values.FilePath("log", "asc", "blf", "pcapng"), metavar="TRACE")
+@argument(
+    "trace", type=values.FilePath("log", "asc", "blf", "pcapng"), metavar="TRACE",
+    help="a recorded trace",
+)  # fmt: skip
 @bench_options
 @option(
     "-y", "--yes", is_flag=True, panel="what is run, and how",

@@ -230,15 +230,15 @@ def replay_line(plan: str, subject: str = "") -> str:
 
 
 @simulate.action("replay", exit_codes=(ExitCode.IMAGE, ExitCode.PARTIAL))
-@argument("text", metavar="PLAN")
+@argument("text", metavar="PLAN", help="the plan, in quotes; - reads it from standard input")
 @_subject
 @option(
     TRACE_FILE, type=values.FilePath("log", "asc", "csv", gives=Path), metavar="FILE",
     panel="reports", help="the frames of the run, as for `flasher explain`",
 )  # fmt: skip
 def replay(output: Output, *, text: str, subject: str | None, trace_file: Path | None) -> int:
-    """Play a plan, as printed with a violation, exactly as it was: - reads it from standard input.
-    With -v, every frame, fault and event is printed.
+    """Play a plan, as printed with a violation, exactly as it was. With -v, every frame, fault and
+    event is printed.
     """
     line = sys.stdin.read(TEXT_MAX_SIZE + 1) if text == "-" else text
     try:
@@ -292,8 +292,9 @@ def _check_device(plan: Plan, subject: str | None) -> None:
 
 @simulate.action("merge", exit_codes=(ExitCode.PARTIAL,))
 @argument(
-    "files", nargs=-1, required=True, type=values.FilePath("jsonl", gives=Path), metavar="FILE..."
-)
+    "files", nargs=-1, required=True, type=values.FilePath("jsonl", gives=Path), metavar="FILE...",
+    help="the ledgers",
+)  # fmt: skip
 @_html
 def merge(output: Output, *, files: tuple[Path, ...], html: Path | None) -> int:
     """Add up the ledgers of a campaign: of its shards, or of several sessions."""
@@ -325,7 +326,7 @@ class Sweep:
 
 
 @simulate.action("sweep", exit_codes=(ExitCode.PARTIAL, ExitCode.INTERRUPTED))
-@argument("names", nargs=-1, metavar="[PART...]")
+@argument("names", nargs=-1, metavar="[PART...]", help="see --list (default: all)")
 @what_option("--list", "is_list", is_flag=True, brief=True, help="list the parts, and end")
 @what_option(
     "--every", type=values.count, default="1", metavar="N", brief=True,

@@ -226,7 +226,7 @@ def backup(
 
 
 @backup.action("restore", epilog=_RESTORE_EXAMPLES)
-@argument("file", metavar="FILE", type=values.FilePath("zip", gives=Path))
+@argument("file", metavar="FILE", type=values.FilePath("zip", gives=Path), help="the archive")
 @option("-y", "--yes", is_flag=True, panel="restore", brief=True, help="do not ask")
 @option(
     "--force", is_flag=True, panel="restore", brief=True,

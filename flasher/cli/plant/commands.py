@@ -364,7 +364,10 @@ def deliveries() -> None:
 
 
 @plant.action("reconcile")
-@argument("file", metavar="FILE", type=values.FilePath("csv", "json", gives=Path))
+@argument(
+    "file", metavar="FILE", type=values.FilePath("csv", "json", gives=Path),
+    help="the keys that the receiver has",
+)  # fmt: skip
 @option("--receiver", metavar="NAME", required=True, brief=True, help="the receiver")
 @option("--resend", is_flag=True, brief=True, help="hand over again what is missing there")
 @_database_option

@@ -129,7 +129,9 @@ def release() -> None:
     """Build, sign, verify and show signed releases (*.wfw) of images."""
 
 
-_file = argument("file", metavar="FILE", type=values.FilePath(SUFFIX.removeprefix(".")))
+_file = argument(
+    "file", metavar="FILE", type=values.FilePath(SUFFIX.removeprefix(".")), help="the release"
+)
 
 
 # -- build ----------------------------------------------------------------------------------------
@@ -151,7 +153,7 @@ def _product(text: str) -> str:
 
 
 @release.action("build", epilog=_BUILD_EXAMPLES)
-@argument("file", metavar="FILE", type=values.FilePath("wfw"))
+@argument("file", metavar="FILE", type=values.FilePath("wfw"), help="the release to write")
 @option(
     "--image", "images", type=_image, multiple=True, required=True, metavar="TARGET=FILE",
     panel="release", help="an image and its target; may be repeated, one for each target",

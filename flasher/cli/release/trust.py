@@ -125,7 +125,7 @@ def trust() -> None:
     """Create and change trust files, and choose whose releases this computer takes."""
 
 
-_file = argument("file", metavar="FILE", type=values.FilePath("json"))
+_file = argument("file", metavar="FILE", type=values.FilePath("json"), help="the trust file")
 _expires = option(
     "--expires", type=coming_date, metavar="DATE", panel="trust file",
     help=f"last day for which releases may be stated (default: in {VALID_DAYS} days)",
@@ -221,7 +221,7 @@ examples:
   flasher trust key release --token 'hsm:2?label=release'     writes release.pub
 """,
 )
-@argument("file", metavar="FILE", type=values.FilePath("key"))
+@argument("file", metavar="FILE", type=values.FilePath("key"), help="the private key to write")
 @option(
     "--scheme", type=click.Choice([each.value for each in Scheme]), default=Scheme.ED25519.value,
     panel="keys", help="kind of key",
@@ -342,8 +342,8 @@ examples:
 """,
 )
 @_file
-@argument("old", metavar="KEY_ID")
-@argument("new", metavar="NEW", type=values.FilePath("pub"))
+@argument("old", metavar="KEY_ID", help="id of the key to be replaced")
+@argument("new", metavar="NEW", type=values.FilePath("pub"), help="the new public key")
 @_expires
 @key_option("the root key that signs")
 @passphrase_options
@@ -390,7 +390,9 @@ examples:
 """,
 )
 @_file
-@argument("key_ids", metavar="[KEY_ID]...", nargs=-1, required=False)
+@argument(
+    "key_ids", metavar="[KEY_ID]...", nargs=-1, required=False, help="ids of the keys to be revoked"
+)
 @option(
     "--minimum", "minimums", type=_minimum, multiple=True, metavar="TARGET:PRODUCT=N",
     panel="trust file", help="withdraw releases of a product with lower counters; may be repeated",
@@ -539,7 +541,10 @@ examples:
   flasher trust install own.json --replace       your own keys, or those of another maker
 """,
 )
-@argument("file", metavar="FILE", type=values.FilePath("json", "wfw"))
+@argument(
+    "file", metavar="FILE", type=values.FilePath("json", "wfw"),
+    help="a trust file, or a release with one",
+)  # fmt: skip
 @option(
     "--replace", "replaces", is_flag=True, panel="trust file",
     help="instead of the trust file that is here, which this one does not succeed",
@@ -575,7 +580,10 @@ examples:
   flasher trust show bike.wfw --json
 """,
 )
-@argument("file", metavar="[FILE]", type=values.FilePath("json", "wfw"), required=False)
+@argument(
+    "file", metavar="[FILE]", type=values.FilePath("json", "wfw"), required=False,
+    help="a trust file, or a release with one (default: that of this computer)",
+)  # fmt: skip
 def show(output: Output, *, file: str | None) -> int:
     """Show a trust file: that of this computer, or one that is named."""
     if file is not None:
