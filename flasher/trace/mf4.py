@@ -18,23 +18,23 @@ from tempfile import TemporaryFile
 from typing import IO, Final
 
 from flasher.builds import module_command
-from flasher.protocol.frame import Frame
 from flasher.python_can import can, load_mf4
 from flasher.trace.bounds import UnfitError
 from flasher.trace.recorder import frame_of, is_classic
 
 _COMMAND: Final = module_command("flasher.trace.mf4")
-_RECORD: Final = Struct("<BdIB")
-"""Kind, time in seconds, CAN id, size of what follows: the data, or the reason of the end."""
+_RECORD: Final = Struct("<BdIhB")
+"""Kind, time in seconds, CAN id, channel (-1 for none), size of what follows: the data, or the
+reason of the end."""
 _END: Final = 1 << 7
 """Kind of the last record; the others have the flags of a frame."""
 _EXTENDED, _REMOTE, _ERROR = 1, 2, 4
 _REASON_MAX: Final = 255
 
 
-def frames_of_measurement(whole: bytes) -> Iterator[tuple[float, Frame]]:
-    """Yield time in seconds and frame of each message of a file with these bytes, without CAN FD.
-    Raises UnfitError for a damaged file, and NotImplementedError without the package.
+def read_measurement(whole: bytes) -> Iterator[can.Message]:
+    """Yield the frames of a file with these bytes, without CAN FD. Raises UnfitError for a damaged
+    file, and NotImplementedError without the package.
     """
     if find_spec("asammdf") is None:
         raise NotImplementedError("the package asammdf (the extra mf4) is not installed")
@@ -55,16 +55,23 @@ def frames_of_measurement(whole: bytes) -> Iterator[tuple[float, Frame]]:
                 process.kill()
 
 
-def _received(source: IO[bytes]) -> Iterator[tuple[float, Frame]]:
+def _received(source: IO[bytes]) -> Iterator[can.Message]:
     while len(head := source.read(_RECORD.size)) == _RECORD.size:
-        kind, at_s, can_id, size = _RECORD.unpack(head)
+        kind, at_s, can_id, channel, size = _RECORD.unpack(head)
         data = source.read(size)
         if kind == _END:
             if data:
                 raise UnfitError(data.decode("utf-8", "replace"))
             return
-        flags = (bool(kind & flag) for flag in (_EXTENDED, _REMOTE, _ERROR))
-        yield at_s, Frame(can_id, data, *flags)
+        yield can.Message(
+            timestamp=at_s,
+            arbitration_id=can_id,
+            is_extended_id=bool(kind & _EXTENDED),
+            is_remote_frame=bool(kind & _REMOTE),
+            is_error_frame=bool(kind & _ERROR),
+            channel=None if channel < 0 else channel,
+            data=data,
+        )
     raise UnfitError("it is damaged: the library for this format ended its process")
 
 
@@ -80,7 +87,8 @@ def _send(output: IO[bytes]) -> str:
             frame = frame_of(message)
             kind = _EXTENDED * frame.is_extended | _REMOTE * frame.is_remote
             kind |= _ERROR * frame.is_error
-            head = _RECORD.pack(kind, message.timestamp, frame.can_id, len(frame.data))
+            channel = -1 if message.channel is None else message.channel
+            head = _RECORD.pack(kind, message.timestamp, frame.can_id, channel, len(frame.data))
             output.write(head + frame.data)
     except Exception as error:  # noqa: BLE001  as above
         return f"{type(error).__name__}: {error!s:.100}"
@@ -90,7 +98,7 @@ def _send(output: IO[bytes]) -> str:
 def main() -> None:
     output, sys.stdout = sys.stdout.buffer, sys.stderr  # what a library prints is no frame
     reason = _send(output).encode("utf-8", "replace")[:_REASON_MAX]
-    output.write(_RECORD.pack(_END, 0.0, 0, len(reason)) + reason)
+    output.write(_RECORD.pack(_END, 0.0, 0, 0, len(reason)) + reason)
     output.flush()
 
 

@@ -30,7 +30,7 @@ from flasher.protocol.text import printable
 from flasher.python_can import can
 from flasher.trace.blf import UnpackedBlf
 from flasher.trace.bounds import FILE_MAX_SIZE, BoundedLines, Bounds, UnfitError, check_unpacked
-from flasher.trace.mf4 import frames_of_measurement
+from flasher.trace.mf4 import read_measurement
 from flasher.trace.pcapng import frames_of_capture
 from flasher.trace.recorder import DATA_MAX, frame_of, is_classic
 
@@ -179,8 +179,7 @@ def _frames(
         whole = source.read(_WHOLE_MAX_SIZE + 1)
         if len(whole) > _WHOLE_MAX_SIZE:
             raise UnfitError(f"it has more than {_WHOLE_MAX_SIZE:,} bytes")
-        yield from frames_of_measurement(whole)
-        return
+        reader = read_measurement(whole)
     else:
         reader = _LINE_READERS[suffix](
             cast(

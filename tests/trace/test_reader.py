@@ -15,6 +15,7 @@ import pytest
 
 from flasher.errors import ExitCode, UsageError
 from flasher.protocol.frame import Frame
+from flasher.python_can import load_mf4
 from flasher.trace.reader import SeveralBusesError, read_trace
 from flasher.trace.recorder import Recorder
 from flasher.trace.source import frames_until_damage
@@ -60,11 +61,20 @@ def test_can_fd_frames_are_left_out(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("suffix", "names"),
-    [(".asc", "12"), (".blf", "12"), (".log", ("can0", "can1")), (".trc", "12")],
+    [
+        (".asc", "12"),
+        (".blf", "12"),
+        (".log", ("can0", "can1")),
+        (".trc", "12"),
+        pytest.param(".mf4", "01", marks=pytest.mark.slow),
+    ],
 )
 def test_two_buses_in_a_trace_are_not_read_as_one(
     tmp_path: Path, suffix: str, names: tuple[str, str]
 ) -> None:
+    if suffix == ".mf4":
+        pytest.importorskip("asammdf", reason="needs the extra mf4")
+        load_mf4()
     path = tmp_path / f"two{suffix}"
     with can.Logger(path) as logger:
         for channel, can_id in ((0, 0x752), (1, 0x725), (0, 0x720), (1, 0x720), (1, 0x721)):
