@@ -100,8 +100,11 @@ class Requirement(Enum):
     """Sends error frames."""
     VERSION = "version"
     """Needs an application that reports its version."""
+    APPLICATION = "application"
+    """Judges an application that runs before the case: without one it cannot fail."""
 
 
+APPLICATION: Final = Requirement.APPLICATION
 DESTRUCTIVE: Final = Requirement.DESTRUCTIVE
 LONG: Final = Requirement.LONG
 POWER: Final = Requirement.POWER

@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 import flasher.conformance.cases  # noqa: F401  registers the cases
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import (
+    APPLICATION,
     BRING_UP,
     CASES,
     DESTRUCTIVE,
@@ -245,9 +246,18 @@ class SuiteRun:
             upgrades=self._options.upgrades or WEAR.get(case.id, 0),
             choices=case.choices_in(self._profile),
         )
+        lacks_application = APPLICATION in case.requires and self._lacks_application()
         verdict, note, self.stopped = execute(case, bench)
         self._adapter_failed = bool(self.stopped) and verdict is CaseVerdict.ERROR
         duration_s, checks = bench.tester.elapsed_s, list(bench.judge.checks)
+        if lacks_application and verdict is CaseVerdict.FAIL:
+            verdict, unsure = CaseVerdict.INCONCLUSIVE, CheckOutcome.INCONCLUSIVE
+            note = f"none: the good image could not be flashed ({self._not_upgradable})"
+            lacking = Check("", unsure, "an application that runs before the case", note, 0.0)
+            checks = [
+                replace(check, outcome=unsure) if check.outcome is CheckOutcome.FAIL else check
+                for check in (lacking, *checks)
+            ]
         if not self.stopped:
             trouble = self.restore_after(case.id, bench, flash=DESTRUCTIVE in case.requires)
             if trouble:
@@ -342,6 +352,18 @@ class SuiteRun:
             final_image_seen_by=self._final_image_seen_by,
             duration_s=port.now() - self._began_at,
         )
+
+    def _lacks_application(self) -> bool:
+        """True when the good image could not be flashed, and no earlier application answers."""
+        if not self._not_upgradable:
+            return False
+        subject, stopped = self._subject, self._must_stop
+        limit_s = CASES[BRING_UP].limit_with(self._profile, subject)
+        bench = Bench(subject, self._profile, limit_s=limit_s, stopped=stopped)
+        try:
+            return not bench.application_runs(bench.waits.burst_s + bench.limit("start_s"))
+        except (BusError, CaseEnded):
+            return False  # the case meets the same
 
     def _failed_bring_up(self, failed: RestoreResult, repeat: int) -> CaseResult:
         """The result of a failed bring-up, with its diagnosis."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 import pytest
@@ -12,7 +13,7 @@ import pytest
 from flasher.bus.simulated import SimulatedBus
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import CASES, HOST_CASES, NOT_IMPLEMENTED, Requirement, Selection
-from flasher.conformance.mock import MockSubject
+from flasher.conformance.mock import MockSubject, device_maker
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.reports import completed, to_bytes
 from flasher.conformance.results import CaseVerdict, CheckOutcome, RunReport, Unsupported
@@ -334,6 +335,30 @@ def test_a_device_that_cannot_be_upgraded_is_judged_all_the_same() -> None:
     assert report.stopped == ""
     assert one(report, "RS-04").verdict in (CaseVerdict.PASS, CaseVerdict.FAIL)
     assert not report.ok
+
+
+def test_a_case_about_a_running_application_is_inconclusive_where_none_could_be_flashed() -> None:
+    empty = device_maker(partial(MockDevice, has_application=False))
+    report = run(
+        MockSubject("bms", good_image=bytes(300 * 1024), make_device=empty),
+        PROFILE,
+        selection=Selection(cases=("BR-01", "RS-01", "RS-04", "UP-03", "UP-05")),
+    )
+    assert one(report, "BR-01").verdict is CaseVerdict.FAIL
+    assert one(report, "UP-05").verdict is CaseVerdict.FAIL
+    for case_id in ("RS-01", "RS-04", "UP-03"):
+        result = one(report, case_id)
+        assert result.verdict is CaseVerdict.INCONCLUSIVE, case_id
+        assert "the good image could not be flashed" in result.reason
+        assert report.not_upgradable in result.reason
+    assert not report.ok
+
+
+def test_an_application_that_still_runs_is_judged_although_the_good_image_is_refused() -> None:
+    device = MockSubject("bms", good_image=bytes(300 * 1024))
+    report = run(device, PROFILE, selection=Selection(cases=("RS-01", "RS-04")))
+    assert report.not_upgradable
+    assert {result.verdict for result in report.results} == {CaseVerdict.PASS}
 
 
 def test_an_adapter_that_is_unplugged_ends_the_run_with_a_true_report() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.catalogue import DESTRUCTIVE, POWER, TIMING, case
+from flasher.conformance.catalogue import APPLICATION, DESTRUCTIVE, POWER, TIMING, case
 from flasher.conformance.judge import TimeName
 from flasher.conformance.wire import (
     READ,
@@ -47,7 +47,7 @@ _LONG_STAY_S: Final = 4320.0
     "Welling 3.2, table 5 (5503); Welling 5.2; Welling 5.2, table 9 (C109); R3",
     stimulus="reset to the running application",
     expectation="general feedback, then boot version 4 times, 50 ms apart",
-    requires={TIMING},
+    requires={APPLICATION, TIMING},
     choices=("device.versions",),
 )
 def reset(bench: Bench) -> None:
@@ -69,6 +69,7 @@ def reset(bench: Bench) -> None:
     clause="Welling 5.1, figure 2 (begin); R18",
     stimulus="two resets in a row; reset after the second boot version",
     expectation="one clean restart; inside the bootloader as the profile says (rs_02)",
+    requires={APPLICATION},
     choices=("rs_02", "device.versions"),
 )
 def reset_again(bench: Bench) -> None:
@@ -107,7 +108,7 @@ def reset_again(bench: Bench) -> None:
     stimulus="silence after the announcements, with an application and, for 70 s, without one; for "
     "72 min in virtual time, longer than microseconds in 32 bits",
     expectation="a valid application is started; without one the bootloader stays (rs_03)",
-    requires={DESTRUCTIVE},
+    requires={APPLICATION, DESTRUCTIVE},
     choices=("rs_03", "rs_03_old"),
     limit_s=300.0 + _LONG_STAY_S,
 )
@@ -160,6 +161,7 @@ def no_update(bench: Bench) -> None:
     stimulus="reset with another text or length, as a read, as a report, to another target's id, "
     "from other nodes",
     expectation="no restart; the application keeps running",
+    requires={APPLICATION},
 )
 def no_reset(bench: Bench) -> None:
     encoder = bench.encoder
@@ -182,7 +184,7 @@ def no_reset(bench: Bench) -> None:
     clause="Welling 5.1, figure 2 (begin); R19",
     stimulus="power off and on",
     expectation="boot version 4 times, 50 ms apart",
-    requires={POWER, TIMING},
+    requires={APPLICATION, POWER, TIMING},
 )
 def power_up(bench: Bench) -> None:
     bench.power_cycle()

@@ -7,7 +7,7 @@ from typing import Final
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases.probe import Probe
-from flasher.conformance.catalogue import DESTRUCTIVE, LONG, TIMING, case
+from flasher.conformance.catalogue import APPLICATION, DESTRUCTIVE, LONG, TIMING, case
 from flasher.conformance.judge import TimeName
 from flasher.conformance.wire import (
     PACKET_BYTES,
@@ -70,7 +70,7 @@ def sizes(bench: Bench) -> None:
     stimulus="update command for 0 bytes, more than the largest image, 2^32 - 1 bytes, the size "
     "of the good image with a bit more beyond the largest image",
     expectation="rejected before anything is erased: the old application starts",
-    requires={DESTRUCTIVE},
+    requires={APPLICATION, DESTRUCTIVE},
     choices=("up_02", "device.largest_image_bytes"),
 )
 def wrong_sizes(bench: Bench) -> None:
@@ -87,7 +87,7 @@ def wrong_sizes(bench: Bench) -> None:
     clause="R17",
     stimulus="update command, packet and end of transfer without a reset before",
     expectation="nothing erased; silence or general feedback (up_03)",
-    requires={DESTRUCTIVE},
+    requires={APPLICATION, DESTRUCTIVE},
     choices=("up_03",),
 )
 def without_reset(bench: Bench) -> None:
@@ -177,7 +177,7 @@ def repeated(bench: Bench) -> None:
     stimulus="names of other targets, each letter another one, small letters; payload too short, "
     "too long, longer than the command states; as a read; a valid one after other targets' names",
     expectation="rejected; the old application starts; the valid one is accepted",
-    requires={DESTRUCTIVE},
+    requires={APPLICATION, DESTRUCTIVE},
     choices=("up_02",),
 )
 def wrong_names(bench: Bench) -> None:
