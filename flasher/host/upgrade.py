@@ -175,8 +175,7 @@ class UpgradeStage:
         self._phase = Phase.BOOT if options.at_power_up else Phase.RESET
         self._asks_for_power = options.at_power_up
         """The user is asked to switch the device off and on."""
-        self._timer_at = inf
-        self._deadline_at = inf
+        self._timer_at = self._deadline_at = inf
         self._began_at = 0.0
         self._ending: tuple[Ending, str] | None = None
         self._outcome: Outcome | None = None
@@ -200,6 +199,7 @@ class UpgradeStage:
         """Ending of an earlier attempt if it had been the last one."""
         self._failed_packet: int | None = None
         """Packet at which an earlier attempt failed."""
+        self._slowest_answer_s = 0.0  # the longest time from a packet, sent once, to its answer
         self._other_answer = ""
         """Describes an answer to a repeated packet that is none by table 9, since the last right
         one."""
@@ -478,8 +478,8 @@ class UpgradeStage:
         timings = self._timings
         match tag, self.state:
             case _, UpgradeState.WATCHING:
-                self._at.watched_until = self._tx.left_at + timings.boot_watch_s
-                return timings.boot_watch_s
+                self._at.watched_until = self._tx.left_at + self._boot_watch_s
+                return self._boot_watch_s
             case Command.PACKET, UpgradeState.TRANSFERRING:
                 return timings.ack_timeout_s
             case Command.PACKET, UpgradeState.SETTLING:
@@ -616,11 +616,19 @@ class UpgradeStage:
         wait_s = (
             timings.boot_version_timeout_s
             if self._duplicates.application_beside
-            else timings.boot_watch_s
+            else self._boot_watch_s
         )
         at.watched_since, at.watched_until = now, now + wait_s
         if self._tx.idle:
             self._timer_at = min(at.watched_until, now + timings.burst_s)
+
+    @property
+    def _boot_watch_s(self) -> float:
+        """Time to watch for a second device: in a transfer, long enough for the answer of a first
+        one that is slow, but not beyond the burst, of which one boot version may be lost.
+        """
+        in_burst_s = 2.5 * self._timings.boot_version_spacing_s
+        return max(self._timings.boot_watch_s, min(2 * self._slowest_answer_s, in_burst_s))
 
     def _watch_on(self, row: BootVersion | GeneralFeedbackMessage) -> None:
         now, timings, at = self._run.now, self._timings, self._at
@@ -810,6 +818,9 @@ class UpgradeStage:
             if self.state is UpgradeState.SETTLING:
                 self._await_quiet(answer)
             return
+        if at.tries == 1 and not is_sending:
+            answer_s = self._run.now - self._tx.left_at
+            self._slowest_answer_s = max(self._slowest_answer_s, answer_s)
         at.copies_unanswered = max(0, at.copies_unanswered - 1)
         at.accepted = at.accepted or accepts
         if at.copies_unanswered or is_sending:

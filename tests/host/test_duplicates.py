@@ -235,11 +235,40 @@ def test_an_ack_of_a_device_that_seems_to_have_restarted_is_another_devices(
     assert "yet packet 6 was acknowledged" in check_two(bench)
 
 
-def test_a_device_that_has_restarted_has_update_command_after_a_moment() -> None:
+@each("answer_s", [0.03, 0.062, 0.12])
+def test_a_second_device_has_no_update_command_while_the_answer_of_a_slow_first_one_is_due(
+    answer_s: float,
+) -> None:
     bench = in_transfer(5)
-    bench.wait(0.07)
+    bench.wait(answer_s)
     bench.say(Ack(5))
     bench.expect(Packet)
+    bench.say(BootVersion("WMC", "V1.2.3"))
+    for passed_s in (0.05, 0.1):
+        if passed_s < answer_s:
+            bench.wait(0.05)
+            bench.say(BootVersion("WMC", "V1.2.3"))
+    bench.wait(answer_s % 0.05)
+    assert bench.unread == [], "the update command waits"
+    bench.say(Ack(6))
+    assert "yet packet 6 was acknowledged" in check_two(bench)
+
+
+def test_a_slow_device_that_has_restarted_has_update_command_before_its_burst_ends() -> None:
+    """Its fourth boot version may be the last that it listens after."""
+    bench = in_transfer(5)
+    bench.wait(0.4)
+    bench.say(Ack(5))
+    bench.expect(Packet)
+    bench.say(BootVersion("WMC", "V1.2.3"))
+    bench.expect(UpdateCommand, within_s=0.13)
+
+
+def test_a_device_that_has_restarted_has_update_command_after_a_moment() -> None:
+    bench = in_transfer(5)
+    bench.say(Ack(5))
+    bench.expect(Packet)
+    bench.wait(0.07)
     bench.say(BootVersion("WMC", "V1.2.3"))
     bench.expect(UpdateCommand, within_s=0.03)
 
