@@ -163,7 +163,7 @@ def _find_again(known: DetectedAdapter) -> str:
         where=known.interface,
         cause=f"the adapter {printable(known.identity[0])} is not plugged in any more, or it has "
         "no serial number and is in another port",
-        remedy="Plug it in where it was. Run the same command again.",
+        remedy="Plug it in where it was.",
         code=ErrorCode.ADAPTER_LOST,
     )
 

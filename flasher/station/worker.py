@@ -217,8 +217,8 @@ class Worker:
         self._presence = Presence([each.profile for each in recipe.targets])
         self._listened_at = connection.clock.now()
         self._suspended_s = suspended_s()
-        self._is_down = False
-        """True while the adapter has failed."""
+        self._down = ""
+        """Reported reason while the adapter has failed; "" while it works."""
         self._is_blocked = False
         """True while the adapter's transmit queue is full."""
         self._reopen_at = 0.0
@@ -241,7 +241,7 @@ class Worker:
 
     def _watch(self) -> None:
         """Watch the bus for units for a moment."""
-        if self._is_down or self._is_blocked:
+        if self._down or self._is_blocked:
             self._reopen()
             return
         link, clock = self._connection.link, self._connection.clock
@@ -260,14 +260,12 @@ class Worker:
             self._is_blocked = True
             self._reopen()
         except BusError as error:
-            self._is_down = True
-            self._pipe.send(AdapterDown(error.what))
+            self._fail(error.what)
         self._listened()
         virtual = self._virtual
-        if virtual is None and not self._is_down and self._was_suspended():
+        if virtual is None and not self._down and self._was_suspended():
             # No frame was received meanwhile: the unit may be another one.
-            self._is_down = True
-            self._pipe.send(AdapterDown(text("This computer was suspended.")))
+            self._fail(text("This computer was suspended."))
             return
         change = self._presence.change(clock.now()) if virtual is None else virtual.step()
         if change is not None:
@@ -297,13 +295,20 @@ class Worker:
         self._reopen_at = clock.now() + REOPEN_S * clock.speed
         try:
             self._connection.link.reopen()
-        except BusError:
+        except BusError as error:
+            self._fail(_why_closed(error))
             return
         self._is_blocked = False
-        if self._is_down:
-            self._is_down = False
+        if self._down:
+            self._down = ""
             self._restart_watching()
             self._pipe.send(AdapterReady(self._presence.sees_units))
+
+    def _fail(self, reason: str) -> None:
+        """Report a failure of the adapter, and then why it cannot be opened."""
+        if reason != self._down:
+            self._down = reason
+            self._pipe.send(AdapterDown(reason))
 
     # -- a run ------------------------------------------------------------------------------------
 
@@ -432,6 +437,11 @@ def load_when_whole(pipe: StationPipe, setup: WorkerSetup) -> LoadedRecipe | Non
     return None
 
 
+def _why_closed(error: BusError) -> str:
+    """Why an adapter cannot be opened, and what helps."""
+    return f"{error.what} {error.remedy}".rstrip()
+
+
 def work_on(
     pipe: StationPipe, setup: WorkerSetup, recipe: LoadedRecipe, opened: Callable[[], Opened]
 ) -> None:
@@ -440,7 +450,7 @@ def work_on(
 
     Raises StationGoneError.
     """
-    is_down = False
+    reported = ""
     while not pipe.is_over:
         try:
             with opened() as (connection, virtual):
@@ -449,9 +459,9 @@ def work_on(
             pipe.send(AdapterDown(error.what, is_final=True))
             return
         except BusError as error:
-            if not is_down:
-                pipe.send(AdapterDown(error.what))
-            is_down = True
+            if (reason := _why_closed(error)) != reported:
+                pipe.send(AdapterDown(reason))
+            reported = reason
             pipe.wait(REOPEN_S)
 
 

@@ -263,12 +263,37 @@ class RealAdapter(Socket):
                 self.bus.unplug(back_after_s=2.5)
 
 
-def test_an_adapter_that_goes_is_reported_once_and_opened_again(tmp_path: Path) -> None:
+def test_an_adapter_that_goes_is_reported_with_what_helps_and_opened_again(tmp_path: Path) -> None:
     socket = RealAdapter(tmp_path)
     Worker(socket.setup, socket.recipe, socket.line, socket.connection()).work()
-    assert socket.kinds == ["AdapterReady", "AdapterDown", "AdapterReady"]
-    assert socket.channel.of(AdapterDown)[0].reason
+    assert socket.kinds == ["AdapterReady", "AdapterDown", "AdapterDown", "AdapterReady"]
+    lost, closed = (each.reason for each in socket.channel.of(AdapterDown))
+    assert "no such device" in lost
+    assert closed == "The adapter cannot be opened: it is not there. Plug it in."
     assert 2.5 <= socket.ready_at[-1] < 3.6
+
+
+def test_an_adapter_that_goes_while_no_unit_acknowledges_is_reported(tmp_path: Path) -> None:
+    """The usual state of an empty socket: its queue is full, and it is opened again."""
+    socket = RealAdapter(tmp_path)
+    connection = socket.connection()
+    reopen = connection.link.reopen
+
+    def answer(channel: FakeChannel, message: FromWorker) -> None:
+        if isinstance(message, AdapterReady) and channel.of(AdapterDown):
+            channel.waiting.append(Stop(ends_process=True))
+
+    def go_first() -> None:
+        if not socket.channel.of(AdapterDown):
+            socket.bus.unplug(back_after_s=2.5)
+        reopen()
+
+    socket.channel._answer = answer
+    socket.bus.is_unacknowledged = True
+    connection.link.reopen = go_first  # type: ignore[method-assign]
+    Worker(socket.setup, socket.recipe, socket.line, connection).work()
+    kinds = [kind for kind in socket.kinds if kind != "PresenceChanged"]
+    assert kinds == ["AdapterReady", "AdapterDown", "AdapterReady"]
 
 
 def test_an_adapter_that_cannot_be_opened_is_reported_once_and_tried_again(tmp_path: Path) -> None:
