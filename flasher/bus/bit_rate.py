@@ -123,8 +123,13 @@ def _of_kernel(merged: Mapping[str, Any]) -> BitRate | None:
     return BitRate(interface.bitrate_bps, f"the kernel's setting of {printable(str(channel))}")
 
 
+def is_same_rate(found_bps: int, wanted_bps: int) -> bool:
+    """True for bit rates of nodes that understand each other."""
+    return abs(found_bps - wanted_bps) <= wanted_bps * _TOLERANCE
+
+
 def _refuse_other(found: BitRate, wanted: BitRate, merged: Mapping[str, Any]) -> None:
-    if abs(found.bps - wanted.bps) <= wanted.bps * _TOLERANCE:
+    if is_same_rate(found.bps, wanted.bps):
         return
     if found.source.startswith("the kernel"):
         commands = change_commands(merged["channel"], f"bitrate {wanted.bps}")

@@ -83,6 +83,17 @@ _LISTEN_ONLY: Final[Mapping[str, Mapping[str, object]]] = {
 }
 """Bus arguments for listen-only mode. SocketCAN is configured by root; python-can has no argument
 for other back ends."""
+_UNFIT_MODES: Final = {
+    "listen-only": (
+        "only listens",
+        "it acknowledges and sends no frame; flasher monitor works as it is",
+    ),
+    "loopback": (
+        "receives its own frames alone",
+        "it reaches no device, and its own frames look like those of another tool",
+    ),
+}
+"""Modes of a SocketCAN interface in which no device can be reached."""
 _PERMISSION: Final = frozenset({errno.EACCES, errno.EPERM})
 
 
@@ -152,7 +163,8 @@ def names_adapter(given: Mapping[str, Any], fallback: Fallback | None = None) ->
 
 def open_bus(config: Mapping[str, Any], *, sends: bool = True) -> can.BusABC:
     """Open a bus by the result of `bus_config`. Raises BusError with cause and remedy, also for an
-    interface that is down, bus-off, or in listen-only mode although the program `sends`.
+    interface that is down, bus-off, or in a mode in which no device can be reached although the
+    program `sends`.
     """
     interface, channel = str(config["interface"]), config.get("channel")
     try:
@@ -191,8 +203,8 @@ def _answers_limited() -> Iterator[None]:
 
 
 def _unusable(channel: str, bitrate_bps: object, *, sends: bool) -> BusError | None:
-    """Return the error for a SocketCAN interface that is down, bus-off or in listen-only mode, all
-    of which open without error. The carrier alone is not enough: gs_usb keeps it after bus-off.
+    """Return the error for a SocketCAN interface that is down, bus-off or in an unfit mode, all of
+    which open without error. The carrier alone is not enough: gs_usb keeps it after bus-off.
     """
     interface = read_interface(channel)
     if isinstance(interface, Unseen) or not interface.is_can:
@@ -216,15 +228,16 @@ def _unusable(channel: str, bitrate_bps: object, *, sends: bool) -> BusError | N
             "starts the controller again."
         )
         return error
-    if sends and interface.only_listens:
-        return BusError(
-            f"The adapter cannot be used: {channel} only listens, and nothing was sent.",
-            where=where,
-            cause="its listen-only mode is on, in which it acknowledges and sends no frame",
-            remedy=f"`{'; '.join(change_commands(channel, 'listen-only off'))}` (as root) lets it "
-            "send; flasher monitor works as it is.",
-            code=ErrorCode.ADAPTER_NOT_OPENED,
-        )
+    for mode, (what, harm) in _UNFIT_MODES.items() if sends else ():
+        if mode.upper() in interface.modes:
+            off = "; ".join(change_commands(channel, mode, "off"))
+            return BusError(
+                f"The adapter cannot be used: {channel} {what}, and nothing was sent.",
+                where=where,
+                cause=f"its {mode} mode is on, in which {harm}",
+                remedy=f"`{off}` (as root) switches it off.",
+                code=ErrorCode.ADAPTER_NOT_OPENED,
+            )
     return None
 
 

@@ -467,6 +467,11 @@ def test_a_link_that_was_handed_a_bus_cannot_be_opened_again(bus: FakeBus) -> No
             ErrorCode.ADAPTER_NOT_OPENED,
             "`ip link set can0 down; ip link set can0 type can listen-only off; ip link",
         ),
+        (
+            Interface("can0", is_can=True, is_up=True, modes=frozenset({"LOOPBACK"})),
+            ErrorCode.ADAPTER_NOT_OPENED,
+            "`ip link set can0 down; ip link set can0 type can loopback off; ip link",
+        ),
     ],
 )
 def test_an_interface_that_opens_but_carries_nothing_is_not_taken_for_open(

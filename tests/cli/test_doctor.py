@@ -311,6 +311,7 @@ AGAIN = ["ip link set can0 down", "ip link set can0 type can {}", "ip link set c
         ),
         ({"modes": frozenset({"LOOPBACK"})}, "itself only", "problem", "loopback off"),
         ({"modes": frozenset({"ONE-SHOT"})}, "is lost", "warning", "one-shot off"),
+        ({"modes": frozenset({"PRESUME-ACK"})}, "counts as sent", "warning", "presume-ack off"),
         (
             {"restart_ms": 0, "driver": "sja1000"},
             "stays off the bus",
@@ -342,6 +343,15 @@ def test_an_interface_that_only_listens_acknowledges_nothing(examine: Doctor) ->
     assert one(run, "can0 opens and")[0] == "ok"
     assert "listens without acknowledging" in one_text(run, "can0 opens and")
     assert run.document["traffic"]["listen_only"]
+
+
+@each("bitrate_bps, severity", [(250_500, "ok"), (249_377, "ok"), (252_000, "problem")])
+def test_a_bit_rate_is_as_good_for_doctor_as_for_the_other_commands(
+    examine: Doctor, bitrate_bps: int, severity: str
+) -> None:
+    """The kernel reports the one that the controller's clock can reach."""
+    examine.interface = replace(CAN0, bitrate_bps=bitrate_bps)
+    assert one(examine(*ON_CAN0), f"runs at {bitrate_bps / 1000:g} kbit/s")[0] == severity
 
 
 def test_settings_that_are_fine_are_noted_without_a_command(examine: Doctor) -> None:

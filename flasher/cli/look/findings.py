@@ -14,6 +14,7 @@ from math import ceil
 from pathlib import Path
 from typing import Final
 
+from flasher.bus.bit_rate import is_same_rate
 from flasher.bus.detect import DetectionResult
 from flasher.bus.fallback import Fallback
 from flasher.bus.health import ControllerState, LinkHealth
@@ -216,14 +217,14 @@ def _bit_rate(state: Interface, name: str, bitrate_bps: int) -> Iterator[Finding
             what = f"the bit rate of {name} is not known; {wanted} is needed"
             fix = (f"ip -details link show {name}",)
             yield _note("interface", what, fix)
-    elif state.bitrate_bps != bitrate_bps:
+    elif not is_same_rate(state.bitrate_bps, bitrate_bps):
         yield _problem(
             "interface",
             f"{name} runs at {state.bitrate_bps / 1000:g} kbit/s, {wanted} is needed",
             change_commands(name, f"bitrate {bitrate_bps}"),
         )
     else:
-        yield _ok("interface", f"{name} runs at {wanted}")
+        yield _ok("interface", f"{name} runs at {state.bitrate_bps / 1000:g} kbit/s")
 
 
 def _modes(state: Interface, name: str) -> Iterator[Finding]:
@@ -231,6 +232,7 @@ def _modes(state: Interface, name: str) -> Iterator[Finding]:
         "LISTEN-ONLY": (Severity.PROBLEM, "nothing can be sent"),
         "LOOPBACK": (Severity.PROBLEM, "it talks to itself only"),
         "ONE-SHOT": (Severity.WARNING, "a frame that meets an error is lost"),
+        "PRESUME-ACK": (Severity.WARNING, "a frame that no device acknowledges counts as sent"),
     }
     for mode, (severity, why) in harm.items():
         if mode in state.modes:
