@@ -14,15 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Unpack
 
-from flasher.api import (
-    CallOptions,
-    Connection,
-    Job,
-    OpenedImage,
-    Profile,
-    open_image,
-    refusal,
-)
+from flasher.api import CallOptions, Connection, Profile
 from flasher.errors import (
     ErrorCode,
     FlasherError,
@@ -34,6 +26,7 @@ from flasher.errors import (
 from flasher.history import Flash, FlashHistory, left_open
 from flasher.host.identity import CheckResult, DeviceAnswers, judge_device, new_version
 from flasher.host.options import serial_number
+from flasher.jobs import Job, OpenedImage, open_image, refusal
 from flasher.procedures import check_no_other_tool, two_devices_error
 from flasher.protocol.contents import RunningInformation, VersionInformation
 from flasher.protocol.spec import BMS, OBC, WMC, Dialect, Target

@@ -30,6 +30,7 @@ from flasher.image.release import Release
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import DIALECTS, TARGET_ALIASES, TARGETS, WELLING, Dialect, Target
 from flasher.protocol.timing import DEFAULT_TIMINGS
+from flasher.settings.manifest import find_release
 from flasher.settings.profile import FILE_NAME, find_bus
 
 # -- the device ------------------------------------------------------------------------------------
@@ -113,8 +114,8 @@ class ImageOptions(SentSelection):
         return self.image == STANDARD_INPUT
 
     def find_release(self, given: str | None = None) -> Release | None:
-        """Read the manifest `given`, else the one beside the image; see `api.find_release`."""
-        return None if given is None and self.is_piped else api.find_release(self.image, given)
+        """Read the manifest `given`, else the one beside the image."""
+        return None if given is None and self.is_piped else find_release(self.image, given)
 
     @cached_property
     def _piped(self) -> io.BytesIO:

@@ -10,5 +10,5 @@
 - `verify`: the checks of a release before anything is sent
 - `build`: how a release comes about
 
-Verifying is `verify.provenance_of`; `flasher.api.open_image` does it for each upgrade.
+Verifying is `verify.provenance_of`; `flasher.jobs.open_image` does it for each upgrade.
 """

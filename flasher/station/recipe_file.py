@@ -14,7 +14,6 @@ from functools import cached_property
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Final
 
-from flasher.api import check_signatures, open_image, prepare
 from flasher.errors import ErrorCode, Fault, FlasherError, UsageError
 from flasher.files import TOML_MAX_SIZE, opened, read
 from flasher.host.identity import Identity, IdentityCheck
@@ -25,6 +24,7 @@ from flasher.i18n import text, with_value
 from flasher.image.image import Image
 from flasher.image.load import FILE_MAX_SIZE, load
 from flasher.image.release import Provenance, Release
+from flasher.jobs import check_signatures, open_image, prepare
 from flasher.protocol.fields import Codec, NumberField
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable

@@ -337,7 +337,8 @@ class UnitSteps:
             watch_s = _SPACINGS_OF_WATCH * timings.boot_version_spacing_s
             watched = replace(timings, boot_watch_s=max(timings.boot_watch_s, watch_s))
             options = replace(options, timings=watched)
-        result = replace(target.job, options=options).run(target.device, on_event=on_event)
+        job = replace(target.job, options=options)
+        result = target.device.run_job(job, on_event=on_event)
         left = result.outcome.device_left
         self.device_state = f"State of the device: {wording(left)}." if left.needs_rescue else ""
         target.check_cancelled()

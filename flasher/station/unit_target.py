@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
-from flasher.api import Connection, prepare
+from flasher.api import Connection
 from flasher.bus.link import AT_ONCE
 from flasher.errors import ErrorCode, InterruptedByUserError, NoAnswerError
 from flasher.host.identify import identify
@@ -15,6 +15,7 @@ from flasher.host.identity import DeviceAnswers
 from flasher.host.items import Readable, meaningful_fields
 from flasher.host.query import Request
 from flasher.host.runner import Runner, Stage
+from flasher.jobs import prepare
 from flasher.protocol.catalogue import BY_KEY
 from flasher.protocol.contents import Reset
 from flasher.protocol.engine import Engine, Tap

@@ -17,7 +17,7 @@ from queue import Empty, Queue
 from typing import Final, TypeVar
 
 from flasher import events
-from flasher.api import Connection, DeviceInfo, Job, prepare, refusal
+from flasher.api import Connection, DeviceInfo
 from flasher.bike import SetImage, check_same_battery, open_bike_set
 from flasher.errors import (
     ErrorCode,
@@ -41,6 +41,7 @@ from flasher.host.outcome import AGAIN
 from flasher.i18n import Text, text, with_value
 from flasher.image.image import Image
 from flasher.image.sample import is_sample, sample_error
+from flasher.jobs import Job, prepare, refusal
 from flasher.kept_settings import settings_of
 from flasher.procedures import nothing_received_error
 from flasher.protocol.contents import RunningInformation, VersionInformation

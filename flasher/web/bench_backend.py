@@ -7,8 +7,9 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Protocol, Unpack
 
-from flasher.api import CallOptions, Connection, Job
+from flasher.api import CallOptions, Connection
 from flasher.history import Flash
+from flasher.jobs import Job
 from flasher.protocol.spec import Dialect, Target
 from flasher.settings.area import Area
 from flasher.settings.profile import Profile

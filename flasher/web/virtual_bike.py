@@ -11,11 +11,12 @@ from math import inf
 from typing import Final
 
 from flasher import events
-from flasher.api import Connection, Job
+from flasher.api import Connection
 from flasher.bus.bit_rate import BitRate
 from flasher.bus.link import Clock, SteadyClock, VirtualClock
 from flasher.bus.simulated import SimulatedBus
 from flasher.i18n import text
+from flasher.jobs import Job
 from flasher.mock.clients import ClientApplication
 from flasher.mock.faults import AtTime, FaultInjector, InOperation, PowerCut
 from flasher.mock.model import MockDevice

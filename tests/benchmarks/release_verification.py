@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from flasher import api
+from flasher import jobs
 from flasher.protocol.spec import BMS
 from flasher.settings.profile import load_profile
 
@@ -41,8 +41,8 @@ def main() -> None:
         image = Path(__file__).parents[2] / "firmware_samples" / "bms.bin"
         plain = Path(folder) / "bms.bin"
         plain.write_bytes(image.read_bytes())
-        api.prepare(plain, profile).checked()
-        print(f"without a trust file: {_milliseconds(lambda: api.prepare(plain, profile)):.2f} ms")
+        jobs.prepare(plain, profile).checked()
+        print(f"without a trust file: {_milliseconds(lambda: jobs.prepare(plain, profile)):.2f} ms")
         before = _peak_mb()
         began = time.perf_counter()
         import securesystemslib.signer  # noqa: PLC0415, F401  what it costs is measured
@@ -65,9 +65,9 @@ def main() -> None:
         raw = maker.release(signers=("anna", "bert"))
         path = Path(folder) / "bike.wfw"
         path.write_bytes(raw)
-        api.prepare(path, profile).checked()
+        jobs.prepare(path, profile).checked()
         before = _peak_mb()
-        signed = _milliseconds(lambda: api.prepare(path, profile))
+        signed = _milliseconds(lambda: jobs.prepare(path, profile))
         print(f"a release, 2 of 2 signatures: {signed:.2f} ms")
         package, trust = opened(raw), maker.chain.newest
         print(f"  opening it: {_milliseconds(lambda: opened(raw)):.2f} ms")

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import flasher
-from flasher import api, procedures
+from flasher import api, jobs, procedures
 from flasher.errors import ErrorCode, FlasherError, ImageError, UsageError, WrongDeviceError
 from flasher.host.identity import WAIVABLE, IdentityCheck
 from flasher.host.waivers import BOOT_VERSION, OF_DEVICE, OUTSIDE_VECTOR, WAIVERS
@@ -27,7 +27,7 @@ PROFILE = Profile(BMS, WELLING, has_upgrade=True)
 IMAGE = flasher.Image.from_bytes(VECTORS + bytes(range(256)))
 
 
-def refused(job: api.Job) -> FlasherError:
+def refused(job: jobs.Job) -> FlasherError:
     with pytest.raises(FlasherError) as caught:
         job.checked()
     return caught.value
@@ -35,24 +35,24 @@ def refused(job: api.Job) -> FlasherError:
 
 def test_what_speaks_against_an_image_is_in_the_job_and_raised_by_its_check() -> None:
     for_wmc = flasher.Image.from_bytes(VECTORS + b"WMC_UPD" + bytes(100))
-    job = api.prepare(for_wmc, PROFILE)
+    job = jobs.prepare(for_wmc, PROFILE)
     assert [found.check for found in job.checks if found.ending is not None] == [
         IdentityCheck.TARGET
     ]
     assert isinstance(refused(job), WrongDeviceError)
     assert refused(job).where == "before anything was sent"
     text = flasher.Image.from_bytes(b"some text\n" * 40)
-    job = api.prepare(text, PROFILE)
+    job = jobs.prepare(text, PROFILE)
     assert refused(job).code is ErrorCode.IMAGE_IMPLAUSIBLE
-    assert api.prepare(text, PROFILE, waived=["implausible"]).checked().checks
-    good = api.prepare(IMAGE, PROFILE)
+    assert jobs.prepare(text, PROFILE, waived=["implausible"]).checked().checks
+    good = jobs.prepare(IMAGE, PROFILE)
     assert good.checked() is good
 
 
 def test_a_level_that_is_not_possible_is_refused_by_the_check_of_the_job() -> None:
-    job = api.prepare(IMAGE, PROFILE, verify="memory")  # a raw binary without a base
+    job = jobs.prepare(IMAGE, PROFILE, verify="memory")  # a raw binary without a base
     assert "without addresses" in refused(job).what
-    wmc = api.prepare(IMAGE, Profile(WMC, WELLING, has_upgrade=True), verify="version")
+    wmc = jobs.prepare(IMAGE, Profile(WMC, WELLING, has_upgrade=True), verify="version")
     assert isinstance(refused(wmc), UsageError)
 
 
@@ -84,7 +84,7 @@ def test_an_image_is_loaded_and_planned_once(
 
         monkeypatch.setattr(module, name, call)
 
-    counted(api, "load")
+    counted(jobs, "load")
     for module in (api, procedures):
         counted(module, "make_plan")
     assert flasher.flash(path, "bms", mock=True).ok
@@ -97,19 +97,19 @@ def test_the_manifest_gives_the_version_and_the_oldest_bootloader_unless_waived(
     asking = replace(release, minimum_boot_version="V3.0.0")
     identity = PROFILE.identity(release=asking)
     image = load(RELEASED)
-    job = api.prepare(image, PROFILE, identity=identity)
+    job = jobs.prepare(image, PROFILE, identity=identity)
     assert job.options.minimum_boot_version == "V3.0.0"
     chosen = PROFILE.upgrade_options(minimum_boot_version="V2.0.0")
-    job = api.prepare(image, PROFILE, identity=identity, options=chosen)
+    job = jobs.prepare(image, PROFILE, identity=identity, options=chosen)
     assert job.options.minimum_boot_version == "V2.0.0"
-    job = api.prepare(image, PROFILE, identity=identity, waived=[BOOT_VERSION])
+    job = jobs.prepare(image, PROFILE, identity=identity, waived=[BOOT_VERSION])
     assert job.options.minimum_boot_version is None
     nameless = replace(image, version=None)
-    assert api.prepare(nameless, PROFILE, identity=identity).plan.image.version == (
+    assert jobs.prepare(nameless, PROFILE, identity=identity).plan.image.version == (
         release.firmware_version
     )
     with pytest.raises(ImageError, match="is not the image of its manifest"):
-        api.prepare(IMAGE, PROFILE, identity=identity)
+        jobs.prepare(IMAGE, PROFILE, identity=identity)
 
 
 @pytest.mark.slow
@@ -119,14 +119,14 @@ def test_the_command_line_runs_what_a_program_prepares(
     command: str, options: list[str], flasher: Flasher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The page of a bench calls it as a program does."""
-    jobs: list[api.Job] = []
-    real = api.prepare
+    made: list[jobs.Job] = []
+    real = jobs.prepare
 
-    def noted(*args: Any, **kwargs: Any) -> api.Job:
-        jobs.append(real(*args, **kwargs))
-        return jobs[-1]
+    def noted(*args: Any, **kwargs: Any) -> jobs.Job:
+        made.append(real(*args, **kwargs))
+        return made[-1]
 
-    monkeypatch.setattr(api, "prepare", noted)
+    monkeypatch.setattr(jobs, "prepare", noted)
     flasher(command, RELEASED, "-t", "bms", "--mock", "--mock-speed", "0", *options)
     waived = {
         0: [],
@@ -140,7 +140,7 @@ def test_the_command_line_runs_what_a_program_prepares(
         at_power_up=command == "rescue",
         waived=waived,
     ).checked()
-    (job,) = jobs
+    (job,) = made
     # The command line looks for images to go back to as well, where a running version is reported.
     assert (job.identity.images_here is not None) is (command == "flash")
     job = replace(job, identity=replace(job.identity, images_here=None))

@@ -179,7 +179,7 @@ def interrupt(*_arguments: object, **_options: object) -> None:
     raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("where", ["flasher.api.load", "flasher.api.Device.upgrade"])
+@pytest.mark.parametrize("where", ["flasher.jobs.load", "flasher.api.Device.upgrade"])
 def test_an_interruption_anywhere_is_exit_code_130_without_a_traceback(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from flasher import api
+from flasher import jobs
 from flasher.errors import FlasherError
 from flasher.image.load import load
 from flasher.protocol.spec import BMS
@@ -125,7 +125,7 @@ def verdict(raw: bytes, path: Path) -> str:
     """
     path.write_bytes(raw)
     try:
-        job = api.prepare(path, load_profile(os.devnull, BMS)).checked()
+        job = jobs.prepare(path, load_profile(os.devnull, BMS)).checked()
     except FlasherError as error:
         return error.code
     assert job.plan.image.data == load(IMAGE).data

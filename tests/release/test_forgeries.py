@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from flasher import api
+from flasher import jobs
 from flasher.errors import ErrorCode, FlasherError
 from flasher.protocol.spec import BMS, OBC, WMC
 from flasher.release import container
@@ -74,7 +74,7 @@ class Case:
 
     def code_of(self, path: Path) -> ErrorCode | None:
         try:
-            api.prepare(path, load_profile(os.devnull, BMS)).checked()
+            jobs.prepare(path, load_profile(os.devnull, BMS)).checked()
         except FlasherError as error:
             refused = error
         else:
@@ -579,7 +579,7 @@ def test_an_image_of_a_set_is_chosen_by_the_target(case: Case) -> None:
     assert case.code(raw) is None
     path = case.folder / "bike.wfw"
     for target in (BMS, WMC, OBC):
-        job = api.prepare(path, load_profile(os.devnull, target)).checked()
+        job = jobs.prepare(path, load_profile(os.devnull, target)).checked()
         assert job.plan.image.named_targets in (frozenset(), frozenset({target}))
 
 
@@ -611,7 +611,7 @@ def test_a_computer_that_cannot_store_what_it_saw_is_warned(case: Case, tmp_path
     data.write_text("in the way")
     path = case.folder / "bike.wfw"
     path.write_bytes(raw)
-    job = api.prepare(path, load_profile(os.devnull, BMS))
+    job = jobs.prepare(path, load_profile(os.devnull, BMS))
     provenance = job.checked().identity.provenance
     assert provenance is not None
     assert provenance.problem is None

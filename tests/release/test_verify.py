@@ -73,10 +73,10 @@ def test_what_was_seen_is_kept_in_the_data_folder(own_computer: Path) -> None:
 
 _WITHOUT_TRUST = """
 import os, sys
-from flasher import api
+from flasher import api, jobs
 from flasher.protocol.spec import BMS
 from flasher.settings.profile import load_profile
-api.prepare(sys.argv[1], load_profile(os.devnull, BMS)).checked()
+jobs.prepare(sys.argv[1], load_profile(os.devnull, BMS)).checked()
 wanted = {"flasher.release.verify", "securesystemslib", "cryptography"}
 sys.exit(repr(wanted & sys.modules.keys()) if wanted & sys.modules.keys() else 0)
 """

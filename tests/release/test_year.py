@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from flasher import api
+from flasher import jobs
 from flasher.errors import ErrorCode, FlasherError
 from flasher.image.release import Provenance
 from flasher.protocol.spec import BMS
@@ -33,7 +33,7 @@ class Workshop:
         path = self._folder / "stick.wfw"
         path.write_bytes(raw)
         try:
-            job = api.prepare(path, load_profile(os.devnull, BMS)).checked()
+            job = jobs.prepare(path, load_profile(os.devnull, BMS)).checked()
         except FlasherError as error:
             assert found.problem is not None
             return error.code

@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec
 
-from flasher.api import Job
 from flasher.cli.look.backup import backup_folder
 from flasher.cli.options import Bus
 from flasher.cli.output import Output
@@ -19,6 +18,7 @@ from flasher.cli.stop import Stop
 from flasher.cli.upgrade.bench_page import LastChoices, VirtualBikes
 from flasher.cli.values import IMAGE_SUFFIXES, TRACE_SUFFIXES
 from flasher.image.release import Release
+from flasher.jobs import Job
 from flasher.protocol.spec import BMS
 from flasher.settings.manifest import manifest_path, to_toml
 from flasher.web.archive import PAGES as KEPT

@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 
 from flasher import events
-from flasher.api import DeviceInfo, Job
+from flasher.api import DeviceInfo
 from flasher.errors import BusError, ErrorCode
+from flasher.jobs import Job
 from flasher.protocol.engine import Tap
 from flasher.protocol.spec import BMS, Target
 from flasher.web.bench import BenchController

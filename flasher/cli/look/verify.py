@@ -8,7 +8,7 @@ from typing import Final
 
 import click
 
-from flasher import api, events
+from flasher import api, events, jobs
 from flasher.cli import values
 from flasher.cli.bar import Bar
 from flasher.cli.documents import ImageDocument
@@ -102,7 +102,7 @@ def verify(
     """
     settings = load_profile(profile, target, bus.dialect)
     # What is only compared may be an image that would not be sent.
-    opened = api.open_image(image.source, target, manifest=manifest, **image.options(force=True))
+    opened = jobs.open_image(image.source, target, manifest=manifest, **image.options(force=True))
     bus = bus.with_profile(profile)
     options = settings.upgrade_options()
     plan = api.make_plan(

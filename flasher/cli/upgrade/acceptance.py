@@ -15,7 +15,7 @@ from typing import Final
 
 import click
 
-from flasher import __version__, api
+from flasher import __version__, api, jobs
 from flasher.cli import values
 from flasher.cli.adapters import choose_adapter
 from flasher.cli.documents import ImageDocument
@@ -190,10 +190,10 @@ def acceptance(
         check_not_read(each, _OUT, [image.image])
         check_new(each, _OUT, force=overwrites)
     settings = load_profile(profile, target, bus.dialect)
-    opened = api.open_image(image.source, target, **image.options())
+    opened = jobs.open_image(image.source, target, **image.options())
     settings.check_fits(opened.image)
     bus = choose_adapter(bus.with_profile(profile), output)
-    job = api.prepare(opened, settings, bitrate_bps=bus.bit_rate.bps)
+    job = jobs.prepare(opened, settings, bitrate_bps=bus.bit_rate.bps)
     try:
         job.checked()
     except FlasherError as error:
@@ -238,7 +238,7 @@ class _Walk:
 
     output: Output
     bus: Bus
-    job: api.Job
+    job: jobs.Job
     profile: Profile
     stop: Stop
     path: Path
@@ -370,7 +370,7 @@ class _Walk:
             self._try(STEPS[-1], lambda: self._compare(device.identify()))
 
     def _flash(
-        self, connection: api.Connection, job: api.Job, *, until_packet: int | None = None
+        self, connection: api.Connection, job: jobs.Job, *, until_packet: int | None = None
     ) -> str:
         """Upgrade the device; with `until_packet` end at this packet, as a user would."""
         is_wanted = until_packet is not None
@@ -434,7 +434,7 @@ class _Walk:
         job, total = self.job, self.job.plan.total_packets
         ended = self._flash(connection, job, until_packet=max(1, total // 2))
         self._details.append(f"interrupted: {ended}")
-        rescue = api.prepare(
+        rescue = jobs.prepare(
             job.plan.image,
             self.profile,
             bitrate_bps=job.plan.bitrate_bps,

@@ -18,7 +18,7 @@ from typing import Final, Unpack
 import click
 from platformdirs import user_state_path
 
-from flasher.api import CallOptions, Connection, Job
+from flasher.api import CallOptions, Connection
 from flasher.bus.opening import bus_config
 from flasher.bus.physical import is_physical
 from flasher.cli.adapters import describe_adapter, detect_until, slcan_ports, with_adapter
@@ -36,6 +36,7 @@ from flasher.files import parse_json, read
 from flasher.history import Flash, FlashHistory, latest_left_open
 from flasher.host.options import DEFAULT_ATTEMPTS
 from flasher.i18n import text
+from flasher.jobs import Job
 from flasher.protocol.spec import BMS, Target
 from flasher.protocol.text import printable
 from flasher.settings.area import Area

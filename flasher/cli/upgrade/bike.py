@@ -12,7 +12,7 @@ from typing import Final, Literal
 
 import click
 
-from flasher import api
+from flasher import api, jobs
 from flasher.bike import (
     ORDER_REASON,
     SetImage,
@@ -67,7 +67,7 @@ class _Device:
     """A device of the set, and what is known of its upgrade."""
 
     part: SetImage
-    job: api.Job
+    job: jobs.Job
     state: DeviceState = DeviceState.NOT_BEGUN
     was_in_bootloader: bool = False
     checks: list[CheckMade] = field(default_factory=list)
@@ -178,7 +178,7 @@ class BikeUpgrade:
                 "--without leaves a device alone.",
             )
 
-    def _job(self, part: SetImage) -> api.Job:
+    def _job(self, part: SetImage) -> jobs.Job:
         profile = self._profile(part.target)
         profile.check_fits(part.opened.image)
         options = profile.upgrade_options()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import click
 
-from flasher import api
+from flasher import jobs
 from flasher.cli import values
 from flasher.cli.framework import Decorator, option, option_set, rebuild_command_line
 from flasher.cli.options import STANDARD_INPUT, Bus, gap_options, profile_option
@@ -146,7 +146,7 @@ class UpgradeChoices:
 
     def job(
         self,
-        opened: api.OpenedImage,
+        opened: jobs.OpenedImage,
         path: str | Path,
         profile: Profile,
         bus: Bus,
@@ -156,7 +156,7 @@ class UpgradeChoices:
         at_power_up: bool = False,
         power_up_timeout_s: float | None = None,
         skip_same_version: bool = False,
-    ) -> api.Job:
+    ) -> jobs.Job:
         """Prepare the upgrade of a device with the image of a file. Raises ImageError and
         UsageError.
         """
@@ -166,7 +166,7 @@ class UpgradeChoices:
         found = None
         if not self.dry_run and not at_power_up:  # a version is reported
             found = images_here(profile.target, images_beside(path, values.IMAGE_SUFFIXES))
-        return api.prepare(
+        return jobs.prepare(
             opened,
             profile,
             bitrate_bps=bus.bit_rate.bps,

@@ -11,7 +11,7 @@ from typing import Final
 
 import click
 
-from flasher import api
+from flasher import api, jobs
 from flasher.cli import values
 from flasher.cli.adapters import check_heard, choose_adapter
 from flasher.cli.framework import (
@@ -229,10 +229,10 @@ class _Upgrade:
             )
         )
 
-    def _open(self) -> api.OpenedImage:
+    def _open(self) -> jobs.OpenedImage:
         choices = self.choices
         choices.check_contradictions()
-        return api.open_image(
+        return jobs.open_image(
             self.image.source,
             self.target,
             manifest=choices.manifest,
@@ -240,7 +240,7 @@ class _Upgrade:
             **self.image.options(force=choices.force),
         )
 
-    def _carry_out(self, job: api.Job, profile: Profile) -> int:
+    def _carry_out(self, job: jobs.Job, profile: Profile) -> int:
         output = self.output
         ctx = click.get_current_context()
         name, replaced = str(ctx.info_name), image_again(ctx)
@@ -281,7 +281,7 @@ class _Upgrade:
 
     @contextmanager
     def _watching(
-        self, job: api.Job, connection: api.Connection, record: Recording
+        self, job: jobs.Job, connection: api.Connection, record: Recording
     ) -> Iterator[api.CallOptions]:
         """Show the upgrade on the terminal, and stop it on request."""
         output = self.output

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Final
 
-from flasher.api import Job
 from flasher.cli.documents import (
     ImageDocument,
     PlanDocument,
@@ -27,6 +26,7 @@ from flasher.image.image import Image
 from flasher.image.plan import Plan
 from flasher.image.release import names_of
 from flasher.image.sample import is_sample
+from flasher.jobs import Job
 from flasher.protocol.spec import DIALECTS
 from flasher.protocol.text import printable
 from flasher.trace.figures import LinkReport

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from flasher.api import CallOptions, Connection, Job
+from flasher.api import CallOptions, Connection
 from flasher.cli.options import Bus
 from flasher.cli.output import Output
 from flasher.cli.recording import Recording, RecordingOptions, recording
@@ -37,6 +37,7 @@ from flasher.events import (
 from flasher.history import MOCK, Began, Ended, FlashHistory, Reached, left_open, working_folder
 from flasher.host.session import Result
 from flasher.i18n import text
+from flasher.jobs import Job
 from flasher.protocol.contents import VersionInformation
 from flasher.protocol.text import printable
 
@@ -158,8 +159,8 @@ class UpgradeRun:
             on_event(CheckMade(SETTINGS, "unknown", what))
         elif self.keeps_settings:
             self._saved = save_settings(device, on_event, self.restore_command, **calls)
-        result = self.job.run(
-            device,
+        result = device.run_job(
+            self.job,
             taps=record.taps,
             on_event=on_event,
             cancelled=watch.get("cancelled"),
