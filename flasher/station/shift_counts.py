@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import datetime, time, timedelta
 from typing import Final, NamedTuple
 
-from flasher.station.records.model import RunRecord, RunState
+from flasher.station.records.model import RunRecord, RunState, Units
 
 DEFAULT_SHIFTS: Final = (time(6), time(14), time(22))
 CAUSES_MAX: Final = 3
@@ -66,22 +66,22 @@ class ShiftCounts:
         self._runs = runs = [run for run in self._runs if _at(run) >= min(began, hour)]
         shift = [run for run in runs if _at(run) >= began]
         causes = Counter(run.code for run in shift if run.state is not RunState.PASS)
-        first: dict[str, bool] = {}
-        for run in shift:
-            if run.state in (RunState.PASS, RunState.FAIL):
-                first.setdefault(run.serial, run.state is RunState.PASS)
+        judged = _units(run for run in shift if run.state in (RunState.PASS, RunState.FAIL))
         return ShiftFigures(
             _count(run for run in runs if _at(run) >= hour),
             _count(shift),
-            sum(first.values()) / len(first) if first else None,
+            judged.first_pass_share,
             tuple(causes.most_common(CAUSES_MAX)),
         )
 
 
 def _count(runs: Iterable[RunRecord]) -> Count:
-    last = {run.serial: run.state is RunState.PASS for run in runs}
-    good = sum(last.values())
-    return Count(good, len(last) - good)
+    units = _units(runs)
+    return Count(units.passed, units.units - units.passed)
+
+
+def _units(runs: Iterable[RunRecord]) -> Units:
+    return Units.of((run.serial, run.state is RunState.PASS) for run in runs)
 
 
 def _at(run: RunRecord) -> datetime:

@@ -54,9 +54,10 @@ from flasher.station.records.model import (
     UnitState,
 )
 from flasher.station.records.newest import PageCursor
-from flasher.station.records.overview import HOLDERS_COUNTED, By, Overview, Page, Span
+from flasher.station.records.overview import HOLDERS_COUNTED, By, Overview, Page
 from flasher.station.records.rollup import Rollup
 from flasher.station.records.store import Store
+from flasher.station.records.yields import Span
 from flasher.station.reports import Report, csv_text
 from flasher.station.sealed import CERTIFICATE_MAX_SIZE
 from flasher.station.shift_counts import DEFAULT_SHIFTS

@@ -29,7 +29,8 @@ from flasher.station.records.model import (
     StepState,
 )
 from flasher.station.records.newest import PageCursor
-from flasher.station.records.overview import By, InstalledUnit, Overview, Span
+from flasher.station.records.overview import By, InstalledUnit, Overview
+from flasher.station.records.yields import Span
 from flasher.station.shift_counts import DEFAULT_SHIFTS
 from flasher.web import supervisor
 from flasher.web.query_processes import Answer, Question

@@ -15,13 +15,13 @@ from itertools import chain as joined
 from typing import Annotated, Any, Final, Generic, TypeVar
 
 from pydantic import BeforeValidator
-from sqlalchemy import Connection, Select, and_, case, exists, func, literal, or_, select, union_all
+from sqlalchemy import Connection, Select, and_, exists, func, or_, select
 from sqlalchemy.sql.expression import ColumnElement
 
 from flasher.station.records import schema
 from flasher.station.records.chain import data_of
 from flasher.station.records.database import Database
-from flasher.station.records.filters import JUDGED, counting
+from flasher.station.records.filters import counting
 from flasher.station.records.model import (
     FLASH,
     Moment,
@@ -46,14 +46,13 @@ from flasher.station.records.rollup import (
     rounded_s,
 )
 from flasher.station.records.rows import beside_index
+from flasher.station.records.yields import Span, units_in
 
 PAGE_SIZE: Final = 50
 LIFE_SIZE: Final = 10
 IMAGES_MAX: Final = 100
 HOLDERS_COUNTED: Final = 300
 """Count units of an image up to this number: they are scattered, and each costs a disk read."""
-_SPANS_AT_ONCE: Final = 400
-"""Number of time spans in one query; SQLite takes 500."""
 _Row = TypeVar("_Row")
 
 
@@ -91,14 +90,6 @@ class InstalledUnit:
     target: str
     is_confirmed: bool
     """The device confirmed the transfer; otherwise it may hold a part of the image, or none."""
-
-
-@dataclass(frozen=True)
-class Span:
-    """A period of time, without its end."""
-
-    begin: datetime
-    end: datetime
 
 
 class By(StrEnum):
@@ -234,43 +225,19 @@ class Overview:
 
     def yields(self, chosen: RunFilter, spans: Sequence[Span]) -> tuple[list[Units], Units]:
         """Units of each of these consecutive spans, and of the whole period."""
-        whole = Span(spans[0].begin, spans[-1].end)
         found: dict[int, Units] | None = None
         with self._rollup.rolled(chosen) as rolled:
             if rolled is not None:
                 texts = [(utc_text(span.begin), utc_text(span.end)) for span in spans]
                 found = rolled.units(texts)
         if found is None:
-            found = self._units(chosen, spans)
-            found[ALL_SPANS] = self._units(chosen, [whole]).get(0, Units())
+            whole = Span(spans[0].begin, spans[-1].end)
+            with self._database.reading() as connection:
+                found = {at: counts for (_, at), counts in units_in(connection, chosen, spans)}
+                for _, counts in units_in(connection, chosen, [whole]):
+                    found[ALL_SPANS] = counts
         in_spans = [found.get(place, Units()) for place in range(len(spans))]
         return in_spans, found.get(ALL_SPANS, Units())
-
-    def _units(self, chosen: RunFilter, spans: Sequence[Span]) -> dict[int, Units]:
-        run = schema.run.c
-        # Run id times two, plus one for PASS: the least value is that of the first run.
-        ranked = run.id * 2 + case((run.state == RunState.PASS.value, 1), else_=0)
-        found: dict[int, Units] = {}
-        for begin in range(0, len(spans), _SPANS_AT_ONCE):
-            span = _table(spans[begin : begin + _SPANS_AT_ONCE], begin)
-            of_unit = (
-                counting(chosen, span.c.number, run.unit_id)
-                .add_columns(func.min(ranked).label("first"), func.max(ranked).label("last"))
-                .join(span, _within(span))
-                .where(beside_index(run.state).in_(JUDGED))
-                .group_by(span.c.number, run.unit_id)
-                .subquery()
-            )
-            query = select(
-                of_unit.c.number,
-                func.count(),
-                func.sum(of_unit.c.last % 2),
-                func.sum(of_unit.c.first % 2),
-            ).group_by(of_unit.c.number)
-            with self._database.reading() as connection:
-                for number, *counts in connection.execute(query):
-                    found[number] = Units(*map(int, counts))
-        return found
 
     def causes(
         self, chosen: RunFilter, by: By, shifts: Sequence[tuple[Span, str]] = ()
@@ -283,7 +250,7 @@ class Overview:
             column, name_of = _group_of(connection, by, shifts)
             counts: Iterable[Any] = ()
             if rolled is not None:
-                counts, rest = rolled.bad("code", column.name), rolled.tail
+                counts, rest = rolled.bad(column.name), rolled.tail
             # Without their indexes, by which all runs would be read.
             code, group = beside_index(run.code), beside_index(column)
             query = (
@@ -420,25 +387,6 @@ def _group_of(
     names: dict[int | None, str] = {None: ""}
     names |= {row_id: ", ".join(parts) for row_id, *parts in connection.execute(query)}
     return column, names.get
-
-
-def _table(spans: Sequence[Span], first: int) -> Any:
-    """Time spans as a table with the columns `number` (from `first` on), `begin` and `end`."""
-    return union_all(
-        *(
-            select(
-                literal(number).label("number"),
-                literal(utc_text(span.begin)).label("begin"),
-                literal(utc_text(span.end)).label("end"),
-            )
-            for number, span in enumerate(spans, first)
-        )
-    ).cte()
-
-
-def _within(span: Any) -> ColumnElement[bool]:
-    begun_at = schema.run.c.begun_at
-    return and_(begun_at >= span.c.begin, begun_at < span.c.end)
 
 
 def _holders(artifacts: Sequence[int]) -> Select[Any]:

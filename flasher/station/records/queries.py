@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import statistics
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict
 from typing import Any, Final, TypeVar, cast
@@ -33,7 +34,6 @@ from flasher.station.records.model import (
     Units,
     UnitState,
 )
-from flasher.station.records.rollup import EndCounts, Rest, Rollup
 from flasher.station.records.rows import batches
 
 _EVERYTHING: Final = RunFilter()
@@ -95,7 +95,6 @@ class Records:
 
     def __init__(self, database: Database) -> None:
         self._database = database
-        self._rollup = Rollup(database)
 
     def table(self, chosen: RunFilter = _EVERYTHING) -> list[RunRecord]:
         """The runs of a filter, for reports."""
@@ -167,39 +166,31 @@ class Records:
     def figures(self, chosen: RunFilter = _EVERYTHING) -> Figures:
         run = schema.run.c
         duration_s = run.ended_monotonic_s - run.begun_monotonic_s
-        ended = EndCounts()
-        units: Units | None = None
-        rests = [Rest(chosen, [])]
-        with self._rollup.rolled(chosen) as rolled:
-            if rolled is not None:
-                units = rolled.all_units()
-                if units is not None:
-                    rests = rolled.add_ends(ended)
-        first: dict[int, str] = {}
-        last: dict[int, str] = {}
-        for rest in rests:
-            query = counting(
-                rest.chosen, run.unit_id, run.state, run.code, run.is_virtual, duration_s
-            ).where(*rest.conditions)
-            with self._database.reading() as connection:
-                for unit_id, state, *others in connection.execute(query.order_by(run.id)):
-                    ended.add(state, *others)
-                    if state in JUDGED:
-                        first.setdefault(unit_id, state)
-                        last[unit_id] = state
-        if units is None:
-            passed = RunState.PASS.value
-            counts = (list(judged.values()).count(passed) for judged in (last, first))
-            units = Units(len(last), *counts)
-        failures = sorted(ended.failures.items(), key=lambda item: (-item[1], item[0]))
+        by_state: Counter[RunState] = Counter()
+        failures: Counter[str] = Counter()
+        virtual_runs = 0
+        durations_s: list[float] = []
+        verdicts = []
+        query = counting(chosen, run.unit_id, run.state, run.code, run.is_virtual, duration_s)
+        with self._database.reading() as connection:
+            rows = connection.execute(query.order_by(run.id))
+            for unit_id, state, code, is_virtual, seconds in rows:
+                by_state[RunState(state)] += 1
+                virtual_runs += bool(is_virtual)
+                if state in JUDGED:
+                    verdicts.append((unit_id, state == RunState.PASS.value))
+                if state == RunState.PASS.value:
+                    durations_s.append(seconds)
+                elif state != RunState.RUNNING.value:
+                    failures[code] += 1
         return Figures(
-            runs=ended.by_state.total(),
-            **asdict(units),
-            by_state={RunState(state): count for state, count in ended.by_state.items()},
-            virtual_runs=ended.virtual_runs,
-            failures=dict(failures),
-            duration_median_s=statistics.median(ended.durations_s) if ended.durations_s else None,
-            duration_longest_s=max(ended.durations_s, default=None),
+            runs=by_state.total(),
+            **asdict(Units.of(verdicts)),
+            by_state=by_state,
+            virtual_runs=virtual_runs,
+            failures=dict(sorted(failures.items(), key=lambda item: (-item[1], item[0]))),
+            duration_median_s=statistics.median(durations_s) if durations_s else None,
+            duration_longest_s=max(durations_s, default=None),
         )
 
     def capabilities(self, chosen: RunFilter = _EVERYTHING) -> list[Capability]:
