@@ -151,6 +151,7 @@ def _bring_up_to_date(connection: Connection, central: Central, now: datetime) -
     tables = inspect(connection).get_table_names()
     if VERSION_TABLE in tables:
         before = schema_of(connection, central.shown)
+        metadata.create_all(connection)
         _alembic(connection, "upgrade")
         return before
     if tables:

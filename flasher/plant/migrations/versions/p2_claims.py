@@ -8,30 +8,6 @@ down_revision = "1"
 
 def upgrade() -> None:
     op.execute("""
-CREATE TABLE plant_claim (
-    token text NOT NULL,
-    station uuid NOT NULL,
-    part text NOT NULL,
-    serial text NOT NULL,
-    socket text NOT NULL,
-    claimed_at timestamptz NOT NULL,
-    expires_at timestamptz NOT NULL,
-    PRIMARY KEY (token)
-);
-CREATE INDEX claim_of_unit ON plant_claim (part, serial);
-CREATE INDEX claim_of_station ON plant_claim (station, expires_at);
-CREATE TABLE plant_pass (
-    unit_id bigint NOT NULL,
-    is_virtual boolean NOT NULL,
-    run_id bigint NOT NULL,
-    station uuid NOT NULL,
-    PRIMARY KEY (unit_id, is_virtual)
-);
-CREATE TABLE plant_duplicate (
-    run_id bigint NOT NULL,
-    first_run_id bigint NOT NULL,
-    PRIMARY KEY (run_id)
-);
 WITH passed AS (
     SELECT r.id, r.unit_id, r.is_virtual, c.station,
         row_number() OVER (PARTITION BY r.unit_id, r.is_virtual ORDER BY c.id) AS place

@@ -7,4 +7,4 @@ down_revision = "6"
 
 
 def upgrade() -> None:
-    op.execute("ALTER TABLE plant_claim ADD COLUMN takeover text NOT NULL DEFAULT ''")
+    op.execute("ALTER TABLE plant_claim ADD COLUMN IF NOT EXISTS takeover text NOT NULL DEFAULT ''")

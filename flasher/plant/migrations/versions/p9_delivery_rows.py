@@ -8,11 +8,11 @@ down_revision = "8"
 
 def upgrade() -> None:
     op.execute("""
-ALTER TABLE plant_delivery ADD COLUMN row_id bigint NOT NULL DEFAULT '0';
+ALTER TABLE plant_delivery ADD COLUMN IF NOT EXISTS row_id bigint NOT NULL DEFAULT '0';
 UPDATE plant_delivery d SET row_id = c.id FROM chain_row c
     WHERE (c.station, c.number) = (d.station, d.number);
 DROP INDEX plant_delivery_open;
 CREATE INDEX plant_delivery_open ON plant_delivery (state, receiver, row_id)
     WHERE state <> 'confirmed';
-CREATE INDEX plant_delivery_by_row ON plant_delivery (row_id, receiver);
+CREATE INDEX IF NOT EXISTS plant_delivery_by_row ON plant_delivery (row_id, receiver);
 """)
