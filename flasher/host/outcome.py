@@ -288,7 +288,8 @@ _EXPLANATIONS: Final = {
     ),
     Ending.WRONG_DEVICE: ErrorDescription(
         WrongDeviceError,
-        "the connected device is not a {node}, whose bootloader reports {boot_name} Vx.x.x",
+        "another device is connected, or the version of this one has another form: the bootloader "
+        "of a {node} reports {boot_name} Vx.x.x",
         "Check -t/--target and what is connected; --allow-boot-name takes the device as it is.",
     ),
     Ending.BOOT_TOO_OLD: ErrorDescription(

@@ -123,7 +123,7 @@ _EXPLANATIONS: Final = {
         "the application starts slowly (application_start_timeout_s of a profile), does "
         "not know the query, or does not start",
         "Look at the device with flasher info; if it does not answer, power-cycle it and "
-        "look again, then flash it again.",
+        "look again, then flash it again. For one that answers all but its version, --verify none.",
     ),
     Verdict.VERSION_OTHER: _OTHER_IMAGE._replace(code=ErrorCode.OTHER_VERSION),
     Verdict.MEMORY_OTHER: _OTHER_IMAGE,

@@ -128,10 +128,10 @@ def check_starts_inside(image: Image) -> None:
         f"{image.source} does not start inside itself: its reset vector is "
         f"0x{table.reset_vector:08X}",
         where=f"the bytes to send are at 0x{image.base:08X}..0x{end - 1:08X}",
-        cause="part of a program, or the wrong part of a file that merges bootloader and "
-        "application",
-        remedy="Choose the application with --range START:END, or waive this check with "
-        "--allow-outside-vector.",
+        cause="a raw binary with a wrong --base, part of a program, or the wrong part of a file "
+        "that merges bootloader and application",
+        remedy="Correct --base, choose the application with --range START:END, or waive this check "
+        "with --allow-outside-vector.",
         code=ErrorCode.IMAGE_OUTSIDE,
     )
     error.waiver = "outside-vector"

@@ -257,8 +257,9 @@ class Profile:
                 f"{image.source} is outside the device's application area",
                 where=f"0x{image.base:08X}..0x{image.base + image.size_bytes - 1:08X}, the area is "
                 f"0x{area.start:08X}..0x{area.end - 1:08X}",
-                cause="a merged file, or an image for another device",
-                remedy="Choose the application with --range START:END.",
+                cause="a merged file, an image for another device, or a raw binary with a wrong "
+                "--base",
+                remedy="Choose the application with --range START:END, or correct --base.",
                 code=ErrorCode.IMAGE_OUTSIDE,
             )
 

@@ -97,6 +97,7 @@ def test_a_program_that_starts_outside_of_itself_is_refused(reset: int) -> None:
     assert f"0x{reset:08X}" in message
     assert "0x08004000..0x08004FFF" in message
     assert "--allow-outside-vector" in message
+    assert "Correct --base" in message
     table = vector_table(image(STACK, reset))
     assert table is not None
     assert any("points outside" in problem for problem in table.problems)
