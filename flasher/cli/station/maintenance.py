@@ -41,6 +41,7 @@ def open_as_station(records: RecordsOptions, *, changes: bool) -> Store:
 
 def backup(output: Output, records: RecordsOptions, file: Path) -> int:
     with closing(open_to_read(records)) as store:
+        output.progress(f"Copies the records to {printable(str(file))}.")
         check_writable(file, "FILE")
         made = store.backup(file)
     output.result(f"{printable(str(made.path))}: {byte_count(made.size_bytes)}, checked")

@@ -13,7 +13,14 @@ from pathlib import Path
 
 from platformdirs import user_data_path
 
-from flasher.station.records.places import FolderPlace, Place, file_name, place_of
+from flasher.station.records.places import (
+    PATIENCE_S,
+    FolderPlace,
+    Place,
+    call_all,
+    file_name,
+    place_of,
+)
 
 
 @dataclass(frozen=True)
@@ -41,12 +48,12 @@ class KeyLocations:
     def elsewhere(self) -> tuple[Place, ...]:
         """The places apart from the key's folder. Raises UsageError for an invalid URL."""
         here = self.keys_folder.resolve()
-        places = (place_of(text) for text in dict.fromkeys(self.heads))
-        return tuple(
-            each
-            for each in places
-            if not (isinstance(each, FolderPlace) and each.folder.resolve() == here)
-        )
+        places = [place_of(text) for text in dict.fromkeys(self.heads)]
+        folders = [each.folder for each in places if isinstance(each, FolderPlace)]
+        # A share that does not answer is not the key's folder.
+        resolved = call_all([folder.resolve for folder in folders], PATIENCE_S)
+        same = [folder for folder, found in zip(folders, resolved, strict=True) if found == here]
+        return tuple(e for e in places if not (isinstance(e, FolderPlace) and e.folder in same))
 
     def key_file(self, station: str, records_id: str) -> Path:
         return self.keys_folder / file_name(station, records_id, ".key")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, Protocol, TypeVar
@@ -144,6 +145,8 @@ class Copying:
         self._known = source.path.with_name(f"{source.path.name}.places")
         self._wake, self._is_ending = threading.Event(), False
         self._idle = threading.Event()
+        self._begun_s: float | None = None
+        """Time at which the attempt in progress began."""
         self._thread = threading.Thread(target=self._run, daemon=True, name="heads")
         self.fault = ""
         """Reason why the place lacks the last heads; "" if it has them."""
@@ -151,6 +154,13 @@ class Copying:
     @property
     def shown(self) -> str:
         return self._place.shown
+
+    @property
+    def is_behind(self) -> bool:
+        """True if the place lacks the last heads: it cannot be reached, or does not answer."""
+        begun_s = self._begun_s
+        is_late = begun_s is not None and time.perf_counter() - begun_s > PATIENCE_S
+        return is_late or bool(self.fault)
 
     def begin(self) -> None:
         self._thread.start()
@@ -176,6 +186,7 @@ class Copying:
             self._wake.wait(RETRY_S if self.fault else None)
             self._wake.clear()
             is_ending = self._is_ending
+            self._begun_s = time.perf_counter()
             try:
                 self._copy()
             except FlasherError as error:
@@ -184,6 +195,7 @@ class Copying:
                 self._position, self.fault = None, error.strerror or str(error)
             else:
                 self.fault = ""
+            self._begun_s = None
             if not self._wake.is_set():
                 self._idle.set()
             if is_ending:

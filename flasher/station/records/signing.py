@@ -95,7 +95,7 @@ class Signer:
 
     def unkept(self) -> list[str]:
         """Other places that lack the last heads because they cannot be reached."""
-        return [each.shown for each in self.copies if each.fault]
+        return [each.shown for each in self.copies if each.is_behind]
 
     def close(self) -> None:
         """Stop copying heads; the next start copies the rest."""

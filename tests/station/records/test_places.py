@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 import pickle
 import shutil
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +19,7 @@ from sqlalchemy import Connection, create_engine, select, text
 
 from flasher.station.board import Board
 from flasher.station.health import HealthWatch
-from flasher.station.records import schema
+from flasher.station.records import keys, places, schema
 from flasher.station.records.chain import canonical, data_of, digests_of, row_hash
 from flasher.station.records.errors import RecordsCutError
 from flasher.station.records.heads import ChainHead, HeadsFile
@@ -320,6 +321,38 @@ def test_a_place_that_does_not_answer_is_not_waited_for() -> None:
     ended.set()
     assert "did not answer" in str(silent)
     assert good is True
+
+
+def test_a_share_that_hangs_stops_no_station_and_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    share, mounted_again = tmp_path / "share", Event()
+
+    def hanging(call: Callable[[Path], Any]) -> Callable[[Path], Any]:
+        def run(path: Path, *more: Any, **named: Any) -> Any:
+            if path.is_relative_to(share):
+                mounted_again.wait(20.0)
+            return call(path, *more, **named)
+
+        return run
+
+    for module in (keys, places):
+        monkeypatch.setattr(module, "PATIENCE_S", 0.01)
+    monkeypatch.setattr(places.call_all, "__defaults__", (0.01,))
+    for name in ("resolve", "exists", "is_dir", "stat", "open"):
+        monkeypatch.setattr(Path, name, hanging(getattr(Path, name)))
+    began_s = time.perf_counter()
+    bench = Bench(tmp_path, heads=(str(share),))
+    bench.make()
+    assert time.perf_counter() - began_s < 15.0
+    signer = bench.store.signer
+    while not signer.unkept():
+        assert time.perf_counter() - began_s < 15.0
+    assert signer.unkept() == [str(share)]
+    mounted_again.set()
+    assert signer.copies[0].wait(15.0)
+    assert signer.unkept() == []
+    assert verified(bench).is_checked_elsewhere
 
 
 def test_a_keeping_is_sent_to_another_process_without_its_connections(postgres: Server) -> None:
