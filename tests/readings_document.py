@@ -150,10 +150,10 @@ _INTRODUCTION: Final = f"""\
 What `flasher conformance` judges a bootloader by: the clauses of the vendor's document, and R1 to
 R28, how this project reads the places where the documents are silent or contradict themselves. Each
 reading is the default of flasher's host and of its device model. Drawn from
-`flasher/conformance/clauses.py` by `python -m tests.readings_document`; a test keeps it so, and
+`flasher/conformance/clauses.py` by `python -m tests.readings_document`; a test compares them, and
 that the tests named here exist.
 
-Options that change a reading stand in three places: the suite's profile
+Options that change a reading are in three places: the suite's profile
 ([profile of the suite](../reference/conformance_profile.md)), the host's profile
 ([profile](../reference/profile.md)),
 and the choices of the device model (`flasher mock --set`).

@@ -101,7 +101,7 @@ QUESTIONS: Final = (
     Question(
         "line",
         "How does an auditor see that the records are unchanged?",
-        "how-to/station_records.html#tell-whether-records-were-changed",
+        "how-to/station_records.html#detect-changed-records",
         "compares the trail with its hashes",
     ),
     Question(
