@@ -81,7 +81,14 @@ def _count(runs: Iterable[RunRecord]) -> Count:
 
 
 def _units(runs: Iterable[RunRecord]) -> Units:
-    return Units.of((run.serial, run.state is RunState.PASS) for run in runs)
+    """Units by the first and the last of these runs, which are in order."""
+    first: dict[str, bool] = {}
+    last: dict[str, bool] = {}
+    for run in runs:
+        is_passed = run.state is RunState.PASS
+        first.setdefault(run.serial, is_passed)
+        last[run.serial] = is_passed
+    return Units(len(last), sum(last.values()), sum(first.values()))
 
 
 def _at(run: RunRecord) -> datetime:

@@ -14,6 +14,7 @@ from flasher.station.records.rows import beside_index
 
 JUDGED: Final = (RunState.PASS.value, RunState.FAIL.value)
 """Runs with a verdict on the unit; other ends are faults of the station."""
+WITHOUT_CAUSE: Final = (RunState.PASS.value, RunState.RUNNING.value)
 
 
 def counting(chosen: RunFilter, *columns: Any) -> Select[Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, date, datetime
 from enum import IntEnum, StrEnum
@@ -571,16 +571,6 @@ class Units:
     """Number of units whose last such run is a PASS."""
     first_passed: int = 0
     """Number of units whose first such run is a PASS."""
-
-    @classmethod
-    def of(cls, verdicts: Iterable[tuple[Hashable, bool]]) -> Units:
-        """Count the units of runs in order, by unit and whether it passed."""
-        first: dict[Hashable, bool] = {}
-        last: dict[Hashable, bool] = {}
-        for unit, is_passed in verdicts:
-            first.setdefault(unit, is_passed)
-            last[unit] = is_passed
-        return Units(len(last), sum(last.values()), sum(first.values()))
 
     @property
     def yield_share(self) -> float | None:

@@ -21,7 +21,7 @@ from sqlalchemy.sql.expression import ColumnElement
 from flasher.station.records import schema
 from flasher.station.records.chain import data_of
 from flasher.station.records.database import Database
-from flasher.station.records.filters import counting
+from flasher.station.records.filters import WITHOUT_CAUSE, counting
 from flasher.station.records.model import (
     FLASH,
     Moment,
@@ -39,7 +39,6 @@ from flasher.station.records.newest import PageCursor, newest_runs
 from flasher.station.records.queries import RUN_QUERY, details_of, valid
 from flasher.station.records.rollup import (
     ALL_SPANS,
-    WITHOUT_CAUSE,
     Rest,
     Rollup,
     StepTimes,

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from typing import Any, Final, TypeVar, cast
 
 from pydantic import ValidationError
-from sqlalchemy import Connection, Select, literal, select
+from sqlalchemy import Connection, Select, func, literal, select
 
 from flasher.documents import adapter
 from flasher.protocol.text import printable
@@ -17,7 +17,7 @@ from flasher.station.records import chain, schema
 from flasher.station.records.capability import Capability, capabilities
 from flasher.station.records.database import Database
 from flasher.station.records.errors import NotFoundError, RecordsDamagedError
-from flasher.station.records.filters import JUDGED, counting, filtered
+from flasher.station.records.filters import WITHOUT_CAUSE, counting, filtered
 from flasher.station.records.heads import ChainHead
 from flasher.station.records.model import (
     DUPLICATES,
@@ -34,7 +34,8 @@ from flasher.station.records.model import (
     Units,
     UnitState,
 )
-from flasher.station.records.rows import batches
+from flasher.station.records.rows import batches, beside_index
+from flasher.station.records.yields import ALL_TIME, units_in
 
 _EVERYTHING: Final = RunFilter()
 _Row = TypeVar("_Row")
@@ -165,27 +166,27 @@ class Records:
 
     def figures(self, chosen: RunFilter = _EVERYTHING) -> Figures:
         run = schema.run.c
+        # Without their indexes, by which all runs would be read.
+        state, code = beside_index(run.state), beside_index(run.code)
+        ends = counting(chosen, state, code, run.is_virtual, func.count())
         duration_s = run.ended_monotonic_s - run.begun_monotonic_s
+        passes = counting(chosen, duration_s).where(state == RunState.PASS.value)
         by_state: Counter[RunState] = Counter()
         failures: Counter[str] = Counter()
         virtual_runs = 0
-        durations_s: list[float] = []
-        verdicts = []
-        query = counting(chosen, run.unit_id, run.state, run.code, run.is_virtual, duration_s)
         with self._database.reading() as connection:
-            rows = connection.execute(query.order_by(run.id))
-            for unit_id, state, code, is_virtual, seconds in rows:
-                by_state[RunState(state)] += 1
-                virtual_runs += bool(is_virtual)
-                if state in JUDGED:
-                    verdicts.append((unit_id, state == RunState.PASS.value))
-                if state == RunState.PASS.value:
-                    durations_s.append(seconds)
-                elif state != RunState.RUNNING.value:
-                    failures[code] += 1
+            for ended, why, is_virtual, count in connection.execute(
+                ends.group_by(state, code, run.is_virtual)
+            ):
+                by_state[RunState(ended)] += count
+                virtual_runs += is_virtual * count
+                if ended not in WITHOUT_CAUSE:
+                    failures[why] += count
+            durations_s = connection.execute(passes).scalars().all()
+            units = dict(units_in(connection, chosen, [ALL_TIME]))
         return Figures(
             runs=by_state.total(),
-            **asdict(Units.of(verdicts)),
+            **asdict(units.get((0, 0), Units())),
             by_state=by_state,
             virtual_runs=virtual_runs,
             failures=dict(sorted(failures.items(), key=lambda item: (-item[1], item[0]))),

@@ -30,7 +30,7 @@ from flasher.station.records import schema
 from flasher.station.records.chain import ENDINGS
 from flasher.station.records.database import Database, records_id_of
 from flasher.station.records.errors import RecordError
-from flasher.station.records.filters import JUDGED, begun_in, counting, named_in
+from flasher.station.records.filters import JUDGED, WITHOUT_CAUSE, begun_in, counting, named_in
 from flasher.station.records.model import (
     RunFilter,
     RunKind,
@@ -50,7 +50,6 @@ _PAUSE_S: Final = 0.2
 _UNTIL_NEXT_S: Final = 600.0
 _ARRIVAL: Final = timedelta(minutes=10)
 """A transaction lasts less: until then a server may commit an audit row with a lower id."""
-WITHOUT_CAUSE: Final = (RunState.PASS.value, RunState.RUNNING.value)
 _FIRST: Final = select(
     schema.station.c.id,
     select(func.min(schema.audit.c.at))
