@@ -7,6 +7,7 @@ from typing import Final
 
 from flasher.errors import UsageError
 from flasher.host.query import Request
+from flasher.i18n import text
 from flasher.image.plan import Plan
 from flasher.protocol.catalogue import BY_KEY
 from flasher.protocol.fields import Content
@@ -137,6 +138,16 @@ def firmware_version(answer: Content) -> str:
 def serial_number(answer: Content | None) -> str:
     """Return the serial number in an answer to a version query, escaped; empty if it has none."""
     return printable(str(getattr(answer, "serial_number", ""))).strip()
+
+
+def other_unit(answer: Content, serial_before: str) -> str:
+    """Describe the serial number in an answer if it is not `serial_before`; "" if one is empty."""
+    now = serial_number(answer)
+    if not serial_before or now in ("", serial_before):
+        return ""
+    return text(
+        "serial number {now}, it was {before} before the upgrade", now=now, before=serial_before
+    )
 
 
 def overall_timeout_s(plan: Plan, options: UpgradeOptions) -> float:

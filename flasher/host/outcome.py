@@ -256,6 +256,12 @@ TWO_DEVICES_REMEDY: Final = (
     "Each of the two may have the new image, half of it, or no application: connect one alone, "
     "flash it, then the other one alone."
 )
+TWO_UNTOUCHED: Final = ErrorDescription(
+    WrongDeviceError,
+    TWO_DEVICES_CAUSE,
+    "Disconnect one of them. {again}",
+    code=ErrorCode.TWO_DEVICES,
+)
 _EXPLANATIONS: Final = {
     Ending.NO_BOOT_VERSION: ErrorDescription(
         NoAnswerError,
@@ -342,12 +348,7 @@ _EXPLANATIONS: Final = {
         "End the other tool and disconnect it. {again}",
         code=ErrorCode.SECOND_TOOL,
     ),
-    Ending.TWO_DEVICES: ErrorDescription(
-        WrongDeviceError,
-        TWO_DEVICES_CAUSE,
-        "Disconnect one of them. {again}",
-        code=ErrorCode.TWO_DEVICES,
-    ),
+    Ending.TWO_DEVICES: TWO_UNTOUCHED,
     Ending.PACKET_FAILED: ErrorDescription(
         TransferError,
         "the device lost power or contact, the line is disturbed, or the device cannot store this "

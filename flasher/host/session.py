@@ -136,7 +136,6 @@ class UpgradeSession(Runner[Result]):
         # device that may be in an open session is asked first: a running application would answer.
         waits = self._options.at_power_up and not self._options.in_session
         self._identify = None if waits else self._new_identify()
-        self._serial_before = ""
         receivers = (each for each in (*Node, None) if each not in (plan.target.node, Node.CDL))
         self._application_ids = frozenset(can_id(plan.target.node, each) for each in receivers)
         self._upgrade = UpgradeStage(self, plan, self._options)
@@ -213,7 +212,7 @@ class UpgradeSession(Runner[Result]):
             if refused is not None:
                 return refused
             previous = asked.answers.firmware_version
-            self._serial_before = serial_number(asked.answers.version)
+            self._upgrade.serial_before = serial_number(asked.answers.version)
             self._upgrade.announcement = asked.announcement
             self._identify = None
         self.limit_at = inf  # the upgrade observes its deadline itself
@@ -315,7 +314,7 @@ class UpgradeSession(Runner[Result]):
         try:
             if level is Level.VERSION:
                 found = yield from check_version(
-                    self, self._plan, self._options, self._serial_before
+                    self, self._plan, self._options, self._upgrade.serial_before
                 )
             else:
                 found = yield from check_memory(self, self._plan, running_version)

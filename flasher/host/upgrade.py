@@ -21,6 +21,7 @@ from flasher.host.options import (
     OTHER_TOOL_QUIET_S,
     UpgradeOptions,
     firmware_version,
+    other_unit,
 )
 from flasher.host.outcome import DeviceLeft, Outcome, Statistics, describe_progress
 from flasher.host.runner import Runner, Signal, Stage, StageInput
@@ -163,6 +164,7 @@ class UpgradeStage:
         }
         self.announcement: Message | None = None
         """Boot version received before the upgrade."""
+        self.serial_before = ""  # the serial number before the upgrade; "" if unknown
         self.in_session = options.in_session
         """An earlier upgrade may have left the device in its transfer (R26): no application was
         detected, and no update command was sent yet."""
@@ -203,8 +205,7 @@ class UpgradeStage:
         self._other_answer = ""
         """Describes an answer to a repeated packet that is none by table 9, since the last right
         one."""
-        self._second_tool = ""
-        """Description of a second tool's frame."""
+        self._second_tool = ""  # description of its frame
 
         self._acknowledged = self._repetitions = self._naks = self._timeouts = 0
         self._transfer_s: float | None = None
@@ -973,6 +974,10 @@ class UpgradeStage:
             self._query_version(row)
 
     def _judge_version(self, answer: Content) -> None:
+        other = other_unit(answer, self.serial_before)
+        if other:
+            self._end(Ending.UNCONFIRMED, answer, other)
+            return
         running, expected = firmware_version(answer), self._plan.image.version
         self._at.running_version = running
         if expected is None:

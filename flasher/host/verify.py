@@ -22,17 +22,17 @@ from flasher.errors import (
     VerificationError,
     WrongDeviceError,
 )
-from flasher.host.options import UpgradeOptions, firmware_version, serial_number
+from flasher.host.options import UpgradeOptions, firmware_version, other_unit
 from flasher.host.outcome import (
     TWO_DEVICES_CAUSE,
     TWO_DEVICES_REMEDY,
+    TWO_UNTOUCHED,
     DeviceLeft,
     ErrorDescription,
     with_device_state,
 )
 from flasher.host.query import READ_MEMORY, Query, ask, count_answers, memory_bytes, memory_requests
 from flasher.host.runner import Runner, Stage, StageInput, filtered
-from flasher.i18n import text
 from flasher.image.image import AddressSpan
 from flasher.image.plan import Plan
 from flasher.protocol.contents import Memory, ReadMemory
@@ -164,7 +164,7 @@ class Verification:
         ending = f"completed, but {verdict}" if is_after_upgrade else verdict
         what = f"{target.node.name}: {ending}"
         what += f" ({self.detail})." if self.detail else "."
-        if is_after_upgrade or self.verdict in (Verdict.TWO_DEVICES, Verdict.SECOND_TOOL):
+        if is_after_upgrade:
             error = _EXPLANATIONS[self.verdict].create(what, target)
             error.needs_rescue = self.device_left.needs_rescue
             is_named = self.verdict in (Verdict.TWO_DEVICES, Verdict.OTHER_UNIT)
@@ -176,6 +176,10 @@ class Verification:
         return error
 
     def _error_of_comparison(self, target: Target, what: str) -> FlasherError:
+        if self.verdict is Verdict.TWO_DEVICES:
+            return TWO_UNTOUCHED.create(what, target)
+        if self.verdict is Verdict.SECOND_TOOL:
+            return _EXPLANATIONS[self.verdict].create(what, target)
         if self.verdict is Verdict.IN_BOOTLOADER:
             return VerificationError(
                 what,
@@ -314,14 +318,9 @@ def _judge_version(
     version = firmware_version(answer)
     if run.duplicates.evidence:
         return Verification(Level.VERSION, Verdict.TWO_DEVICES, version, run.duplicates.evidence)
-    serial_now = serial_number(answer)
-    if serial_before and serial_now and serial_now != serial_before:
-        detail = text(
-            "serial number {now}, it was {before} before the upgrade",
-            now=serial_now,
-            before=serial_before,
-        )
-        return Verification(Level.VERSION, Verdict.OTHER_UNIT, version, detail)
+    other = other_unit(answer, serial_before)
+    if other:
+        return Verification(Level.VERSION, Verdict.OTHER_UNIT, version, other)
     expected = plan.image.version
     if expected is not None and version != expected:
         difference = f"{version} instead of {expected}"

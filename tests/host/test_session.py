@@ -18,6 +18,7 @@ from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft
 from flasher.host.runner import Runner
 from flasher.host.session import Result, UpgradeSession
+from flasher.host.table import Ending
 from flasher.host.verify import (
     Level,
     Verdict,
@@ -40,6 +41,7 @@ from flasher.protocol.messages import BootVersion
 from flasher.protocol.spec import BMS, OBC, TARGETS, WELLING, WMC
 from flasher.protocol.text import encode_text
 from flasher.protocol.wire import Message, Reassembler, encode, split
+from tests.end_to_end.stage import Stage
 from tests.loops import each
 
 NEW = "V2r0r1_20260102"
@@ -325,6 +327,8 @@ def test_a_comparison_without_an_upgrade_claims_no_completion(
     assert error is not None
     assert error.exit_code == exit_code
     assert "completed" not in str(error)
+    assert not error.needs_rescue
+    assert "half of it" not in str(error), "nothing was sent to either"
 
 
 def test_an_answer_for_another_address_is_not_taken() -> None:
@@ -510,6 +514,30 @@ def test_a_unit_that_is_exchanged_during_the_upgrade_is_exit_code_6() -> None:
     assert "serial number W9, it was W2605001 before the upgrade" in str(error)
     assert session.result.outcome.is_completed
     assert session.result.outcome.device_left is DeviceLeft.UNKNOWN
+
+
+@each("level", [Level.NONE, Level.VERSION])
+def test_the_version_of_another_unit_replaces_no_lost_final_answer(level: Level) -> None:
+    """The first unit is still checking its image when another one is switched on."""
+    stage = Stage()
+    application = stage.device.application
+    assert isinstance(application, BmsApplication)
+    complete = bytes.fromhex("55AA0C04C5020000")
+    stage.disturb = lambda frame, _now: [] if frame.data == complete else [frame]
+
+    def exchange() -> None:
+        if isinstance(stage.events[-1], events.PhaseEntered):
+            phase = stage.events[-1].phase
+            if phase is events.Phase.CONFIRM:
+                other = SerialNumber(WireText(encode_text("W9", 16)))
+                application.kept["serial number"] = other
+
+    stage.at_event[events.PhaseEntered] = exchange
+    result = stage.flash(verify=level, identity=Identity(waived=frozenset(IdentityCheck)))
+    assert result.outcome.ending is Ending.UNCONFIRMED
+    assert result.exit_code == ExitCode.UNCONFIRMED
+    assert result.outcome.running_version is None
+    assert "serial number W9, it was W2605001 before the upgrade" in str(result.error())
 
 
 @each("sends_until_s, runs", [(60.0, True), (40.0, False)])
