@@ -227,7 +227,7 @@ def judge_bike(
         raise NoAnswerError(
             "The BMS did not answer, and does not announce its bootloader: nothing was changed.",
             cause="the bike is off or asleep, or the adapter is on another bus",
-            remedy="Wake the bike with its key; flasher doctor looks at adapter and bus.",
+            remedy="Wake the bike with its key; flasher doctor checks adapter and bus.",
             code=ErrorCode.NOBODY_HEARD,
         )
     for each in left_out:

@@ -690,7 +690,7 @@ def nothing_received_error(survey: Survey, bitrate_bps: int) -> NoAnswerError:
     return NoAnswerError(
         f"No device of the drive system sent anything at {bitrate_bps / 1000:g} kbit/s"
         f"{f'; {foreign}' if count else ''}.",
-        cause="everything is off or asleep, the wiring is open, or the bit rate is another",
+        cause="everything is off or asleep, the wiring is open, or the bit rate is wrong",
         remedy="Switch the system on. Or try --dialect motinova (125 kbit/s) or welling (250).",
         code=ErrorCode.NOBODY_HEARD,
     )

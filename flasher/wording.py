@@ -173,7 +173,7 @@ _RESCUE: Final = "The device stays in its bootloader until an image is flashed c
 
 _EXPLANATIONS: Final[dict[str, Explanation]] = {
     "nobody_acknowledges": Explanation(
-        "no device is connected or powered, the bit rate is another one, CAN-H and CAN-L are "
+        "no device is connected or powered, the bit rate is wrong, CAN-H and CAN-L are "
         "swapped, or the termination is missing",
         f"Check supply, wiring, the 120 ohm termination at both ends, and the bit rate. {_AGAIN}",
     ),

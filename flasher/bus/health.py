@@ -217,9 +217,9 @@ class LinkHealth:
                 f"No node on the bus acknowledges: {self.frames_sent} frames were passed to the "
                 "adapter, and nothing was received.",
                 where=where,
-                cause="the device is off or not connected, the bit rate is another, CAN-H and "
+                cause="the device is off or not connected, the bit rate is wrong, CAN-H and "
                 f"CAN-L are swapped or open, or termination is missing{self._evidence}",
-                remedy="Check power, wiring and bit rate; flasher doctor looks at the adapter.",
+                remedy="Check power, wiring and bit rate; flasher doctor checks the adapter.",
                 code=ErrorCode.NOBODY_ACKNOWLEDGES,
             )
         if self.refused * 2 > self.frames_sent and not self.frames_received:
@@ -266,7 +266,7 @@ def unreadable_error(where: str, how_often: str, words: str) -> BusError:
     return BusError(
         f"The adapter delivers unreadable data, {how_often}: {words}.",
         where=where,
-        cause="its serial speed is another one, or its cable or plug is bad",
+        cause="its serial speed is wrong, or its cable or plug is bad",
         remedy="Try another cable; for slcan, `--bus-kwargs tty_baudrate=...` sets the speed.",
         code=ErrorCode.ADAPTER_LOST,
     )

@@ -148,7 +148,7 @@ def _by_python_can(given: Mapping[str, Any]) -> dict[str, Any]:
         raise _no_interface(error) from error
     except (ValueError, TypeError, configparser.Error) as error:
         raise UsageError(
-            f"The adapter's configuration makes no sense: {printable(error_text(error))}.",
+            f"The adapter's configuration is invalid: {printable(error_text(error))}.",
             remedy="Check the bus arguments, python-can's configuration file and CAN_* variables.",
         ) from error
 

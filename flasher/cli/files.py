@@ -190,6 +190,6 @@ def _not_written(path: Path, option: str, reason: str) -> UsageError:
     return UsageError(
         f"{printable(str(path))} cannot be written: {reason}.",
         where=option,
-        remedy="Name a file in a folder that exists, may be written into, and has room.",
+        remedy="Name a file in a folder that exists, is writable, and has room.",
         code=ErrorCode.FILE_NOT_WRITTEN,
     )

@@ -83,7 +83,7 @@ class WriteResult:
         return VerificationError(
             f"The {node} was sent the new {name} but did not {missing}{known}.",
             cause="the device went away, or it does not take this write",
-            remedy=f"Look with: flasher read {name} -t {self.plan.target.name}",
+            remedy=f"Check with: flasher read {name} -t {self.plan.target.name}",
             code=ErrorCode.WRITE_DIFFERS,
         )
 

@@ -126,7 +126,7 @@ def release(central: Central, chosen: ClaimFilter, reason: str) -> int:
             "No such claim has expired: nothing was released.",
             where=central.shown,
             remedy="flasher plant claims --database URL lists them. A claim that has not expired"
-            " belongs to a unit that is at work; wait for its run.",
+            " belongs to a unit in a run; wait for its end.",
         )
     return count
 

@@ -103,7 +103,7 @@ def is_member_name(name: str) -> bool:
 def damaged(shown: str, why: str, *, where: str = "") -> ImageError:
     """Create the error for a release that cannot be read."""
     return ImageError(
-        text("{file} is no release that can be read: {why}.", file=shown, why=why),
+        text("{file} is not a readable release: {why}.", file=shown, why=why),
         where=where or shown,
         cause=text("a damaged copy, or a file that was changed"),
         remedy=_REMEDY,

@@ -113,7 +113,7 @@ class TrustStore:
                     seen=seen.version,
                 ),
                 cause=text(
-                    "an older copy was put in its place: keys revoked since would hold again"
+                    "an older copy was put in its place: keys revoked since would be valid again"
                 ),
                 remedy=text("Take the newest one: `flasher trust install FILE`, from a release."),
                 code=ErrorCode.TRUST_ROLLED_BACK,

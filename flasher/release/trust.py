@@ -347,7 +347,7 @@ def untrusted(source: str, why: str, *, remedy: str = "") -> FlasherError:
     """Create the error for a trust file that is not used."""
     return UsageError(
         text("The trust file {file} is not used: {why}.", file=printable(source), why=why),
-        cause=text("it was changed by hand, is unfinished, or belongs to somebody else"),
+        cause=text("it was changed by hand, is unfinished, or belongs to another maker"),
         remedy=remedy or text("Take the file as its maker gave it: `flasher trust install FILE`."),
         code=ErrorCode.TRUST_FILE,
     )

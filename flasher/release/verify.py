@@ -148,9 +148,9 @@ def image_of(
 def _differs(shown: str, name: str) -> ImageError:
     return ImageError(
         text("{name} is not what was signed in {file}.", name=name, file=shown),
-        where=text("its SHA-256 is another one than in the statement"),
+        where=text("its SHA-256 differs from that in the statement"),
         cause=text("a damaged copy, another build, or a forgery"),
-        remedy=text("Take image and release again from where they were released."),
+        remedy=text("Get image and release again from their maker."),
         code=ErrorCode.RELEASE_DIFFERS,
     )
 
@@ -304,7 +304,7 @@ def _check(package: Package, target: Target, known: Known) -> frozenset[str]:
                 counter=release.counter,
                 minimum=minimum,
             ),
-            cause=text("an old release, with a fault that was mended since"),
+            cause=text("an old release, with a fault that was fixed since"),
             remedy=text("Take the newest release from its maker."),
             code=ErrorCode.RELEASE_OLD,
         )

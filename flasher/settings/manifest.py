@@ -70,7 +70,7 @@ def reader() -> Reader[Release]:
         Release,
         "manifest",
         error=ImageError,
-        remedy="Correct it, or write it anew with `flasher manifest create --force`.",
+        remedy="Correct it, or write it again with `flasher manifest create --force`.",
         beside=("source",),
         also=(FORMAT_KEY,),
     )

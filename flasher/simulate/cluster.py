@@ -206,7 +206,7 @@ def _lost(cause: str) -> UsageError:
     return UsageError(
         "The Dask cluster lost a batch.",
         cause=cause,
-        remedy="Mend and start the cluster, then run again with the same --ledger.",
+        remedy="Repair and start the cluster, then run again with the same --ledger.",
     )
 
 

@@ -28,7 +28,7 @@ def compare(bench: BenchController) -> None:
     if Level.VERSION not in possible_levels(target, job.options):
         raise UsageError(
             text("The documents give no query for what the {node} runs.", node=target.node.name),
-            remedy=text("Look into the history of this computer: it has each upgrade."),
+            remedy=text("See the history of this computer: it has each upgrade."),
         )
 
     def happened(event: object) -> None:

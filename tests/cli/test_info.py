@@ -137,7 +137,7 @@ def test_the_wmc_cannot_be_asked_and_what_it_sends_is_shown(
     battery.report(0x710, 0x1305, b"READY")
     run = flasher("info", "-t", "wmc", *MOCK)
     assert run.code == ExitCode.OK
-    assert "no question to ask it" in run.out
+    assert "no query for it" in run.out
     assert any(line.startswith("710 1305 ready for shutdown") for line in rows(run.out))
     assert battery.received == []
 
@@ -146,7 +146,7 @@ def test_the_wmc_cannot_be_asked_and_what_it_sends_is_shown(
 def test_a_wmc_that_sends_nothing_is_exit_5_and_reported_to_be_unaskable(flasher: Flasher) -> None:
     run = flasher("info", "-t", "wmc", *MOCK)
     assert run.code == ExitCode.NO_ANSWER
-    assert "no question to ask it" in " ".join(run.err.split())
+    assert "no query for it" in " ".join(run.err.split())
 
 
 @pytest.mark.parametrize("words", [("info",), ("read", "serial-number")])

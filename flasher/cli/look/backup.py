@@ -195,7 +195,7 @@ def backup(
     if READ_MEMORY.receiver is not target.node:
         raise UsageError(
             f"The {target.node.name} has nothing to back up: the documents give no way to read its "
-            "memory, and no question to ask it.",
+            "memory, and no query for it.",
             remedy="Use -t bms; keep the image file that was flashed.",
         )
     check_new(file, _OUTPUT, force=force)

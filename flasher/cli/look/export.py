@@ -245,7 +245,7 @@ def mf4(output: Output, *, trace: Path, file: Path, messages: tuple[str, ...]) -
         raise UsageError(
             f"{printable(str(file))} does not end with .mf4.",
             where=_OUT,
-            remedy="Other programs go by the suffix: name it so.",
+            remedy="Name it with this suffix, by which other programs recognise the format.",
         )
     check_not_read(file, _OUT, [trace])
     found, damage = _rows(trace, messages)

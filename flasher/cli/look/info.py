@@ -89,15 +89,15 @@ def silence_error(found: DeviceInfo) -> NoAnswerError:
     if found.readings:
         return NoAnswerError(
             f"The {node} answered nothing and sent nothing.",
-            cause="it is off, asleep or not connected, or the bit rate or dialect is another",
+            cause="it is off, asleep or not connected, or the bit rate or dialect is wrong",
             remedy="Wake it with its key; list the devices on the bus with flasher scan.",
             code=ErrorCode.NOBODY_HEARD,
         )
     return NoAnswerError(
         f"The {node} sent nothing in {INFO_LISTEN_ONLY_S:g} s, and the documents give no"
-        " question to ask it.",
+        " query for it.",
         cause="it is off, or silent: it sends by itself only now and then",
-        remedy="Try again while it is switched on; flasher scan shows who else is there.",
+        remedy="Try again while it is switched on; flasher scan lists all devices.",
         code=ErrorCode.NOBODY_HEARD,
     )
 
@@ -106,7 +106,7 @@ def _lines(found: DeviceInfo) -> list[str]:
     node = found.target.node.name
     lines = [f"{node}, {found.dialect.name} dialect"]
     if not found.readings:
-        lines.append("The documents give no question to ask it; this is what it sent by itself:")
+        lines.append("The documents give no query for it; this is what it sent by itself:")
         lines += heard_lines(found.survey.heard[found.target.node], contents=True)
         if found.survey.faults:
             lines += ["", "faults of the battery", *content_lines(found.survey.faults)]
