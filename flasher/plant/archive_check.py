@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -19,7 +18,6 @@ from flasher.plant.schema import OWN_PARTS, SHARED_PARTS, kept_run
 from flasher.protocol.text import printable
 from flasher.station.records import chain
 from flasher.station.records.database import Database
-from flasher.station.records.errors import RecordsDamagedError
 from flasher.station.records.examination import ExaminedTrail, Examiner, RunDigests
 from flasher.station.records.files import FileStore
 from flasher.station.records.keys import KeyLocations
@@ -121,16 +119,8 @@ class _Traces(FileStore):
         super().__init__(folder)
         self.data: Mapping[str, bytes] = {}
 
-    def read(self, sha256: str) -> bytes:
-        """Raises RecordError."""
-        data = self.data.get(sha256)
-        if data is None:
-            raise RecordsDamagedError("An attachment is missing.", where=sha256)
-        if hashlib.sha256(data).hexdigest() != sha256:
-            raise RecordsDamagedError(
-                "An attachment was changed after it was stored: its hash differs.", where=sha256
-            )
-        return data
+    def _stored(self, sha256: str) -> bytes | None:
+        return self.data.get(sha256)
 
 
 class AssembledExaminer(Examiner):

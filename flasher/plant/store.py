@@ -19,7 +19,6 @@ from flasher.plant.central import open_central, plant_location
 from flasher.plant.claim_list import released_runs
 from flasher.plant.schema import SHARED_PARTS, archive_file, plant_duplicate, shared_part, trace
 from flasher.station.records.database import Database, Location, locate, open_database
-from flasher.station.records.errors import RecordsDamagedError
 from flasher.station.records.files import FileStore
 from flasher.station.records.heads import ChainHead
 from flasher.station.records.keys import KeyLocations
@@ -82,27 +81,20 @@ def passed_twice(connection: Connection, limit: int) -> list[PassedTwice]:
 class PlantFiles(FileStore):
     """Attachments in a plant's database."""
 
+    cause_missing = "its station could not read it when the run was sent"
+    remedy = "Fetch it from the station or its backup."
+
     def __init__(self, database: Database) -> None:
         super().__init__(database.location.folder)
         self._database = database
 
-    def read(self, sha256: str) -> bytes:
-        """Read an attachment and check its hash. Raises RecordError."""
+    def _stored(self, sha256: str) -> bytes | None:
         query = select(trace.c.data).where(trace.c.sha256 == sha256)
         with self._database.reading() as connection:
-            data = connection.execute(query).scalar_one_or_none()
-        if data is None:
-            raise RecordsDamagedError(
-                "An attachment is missing.",
-                where=sha256,
-                cause="its station could not read it when the run was sent",
-                remedy="Fetch it from the station or its backup.",
-            )
-        if hashlib.sha256(data).hexdigest() != sha256:
-            raise RecordsDamagedError(
-                "An attachment was changed after it was stored: its hash differs.", where=sha256
-            )
-        return bytes(data)
+            return connection.execute(query).scalar_one_or_none()
+
+    def _place(self, sha256: str) -> str:
+        return sha256
 
 
 class PlantRecords(Records):

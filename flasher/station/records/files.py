@@ -30,6 +30,10 @@ _PART_AGE_S: Final = 86_400.0
 class FileStore:
     """The folder of the attachments."""
 
+    cause_missing = ""
+    remedy = "Fetch it from a backup."
+    """What to do about an attachment that is missing or damaged."""
+
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
@@ -118,19 +122,27 @@ class FileStore:
         return self.folder / sha256[:2] / sha256
 
     def read(self, sha256: str) -> bytes:
-        """Read a file and check its hash. Raises RecordsDamagedError."""
-        path = self.path(sha256)
-        shown, remedy = printable(str(path)), "Fetch it from a backup."
-        with mapped(shown, writes=False):
+        """Read an attachment and check its hash. Raises RecordsDamagedError, RecordError."""
+        data = self._stored(sha256)
+        if data is None:
+            what, cause = "An attachment is missing.", self.cause_missing
+        elif hashlib.sha256(data).hexdigest() != sha256:
+            what, cause = "An attachment was changed after it was stored: its hash differs.", ""
+        else:
+            return data
+        raise RecordsDamagedError(what, where=self._place(sha256), cause=cause, remedy=self.remedy)
+
+    def _stored(self, sha256: str) -> bytes | None:
+        """Content of an attachment; None if it is missing."""
+        with mapped(self._place(sha256), writes=False):
             try:
-                data = path.read_bytes()
-            except FileNotFoundError as error:
-                what = "An attachment is missing."
-                raise RecordsDamagedError(what, where=shown, remedy=remedy) from error
-        if hashlib.sha256(data).hexdigest() != sha256:
-            what = "An attachment was changed after it was stored: its hash differs."
-            raise RecordsDamagedError(what, where=shown, remedy=remedy)
-        return data
+                return self.path(sha256).read_bytes()
+            except FileNotFoundError:
+                return None
+
+    def _place(self, sha256: str) -> str:
+        """Where an attachment is stored, for messages."""
+        return printable(str(self.path(sha256)))
 
     def check(self, sha256: str) -> str:
         """Fault of a file, in words; "" if it is intact."""
