@@ -210,6 +210,19 @@ def test_a_target_without_queries_has_steps_that_cannot_be_tried(flasher: Flashe
 
 
 @pytest.mark.slow
+def test_a_target_without_queries_that_sends_nothing_is_upgraded_all_the_same(
+    flasher: Flasher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(DeviceInfo, "is_there", False)
+    words = ("acceptance", SAMPLES / "obc.bin", "-t", "obc", *MOCK, "--yes", "--interrupt")
+    run = flasher(*words, "--json")
+    assert run.code == 0
+    assert states(run.document)["identity"] == "not possible"
+    assert states(run.document)["interrupted and rescued"] == "passed"
+    assert states(run.document)["identity afterwards"] == "not possible"
+
+
+@pytest.mark.slow
 def test_a_check_of_the_device_that_refuses_names_no_option_to_waive_it(
     walk: Callable[..., Run], tmp_path: Path
 ) -> None:
