@@ -16,6 +16,7 @@ from flasher.station.records.model import (
     RunKind,
     RunState,
     Units,
+    local_moment,
     utc_moment,
 )
 from flasher.station.records.yields import ALL_TIME, Span, units_in
@@ -70,9 +71,9 @@ def activities(
     connection: Connection, shifts: Sequence[time], now: datetime, runs: int
 ) -> Mapping[str, Activity]:
     """Activity of each station that has runs, by its name, with the last `runs` of each socket. Day
-    and shift are those of the time zone of `now`.
+    and shift are those of the time zone of this computer.
     """
-    day = datetime.combine(now.date(), time(), now.tzinfo)
+    day = local_moment(datetime.combine(now.astimezone(), time()))
     shift = shift_began(shifts, now) or day
     spans = [Span(begin, ALL_TIME.end) for begin in (shift, day)]
     chosen = RunFilter(since=min(day, shift))

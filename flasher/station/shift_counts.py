@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import datetime, time, timedelta
 from typing import Final, NamedTuple
 
-from flasher.station.records.model import RunRecord, RunState, Units
+from flasher.station.records.model import RunRecord, RunState, Units, local_moment
 
 DEFAULT_SHIFTS: Final = (time(6), time(14), time(22))
 CAUSES_MAX: Final = 3
@@ -34,9 +34,12 @@ class ShiftFigures:
 
 
 def shift_began(shifts: Iterable[time], now: datetime) -> datetime | None:
-    """Start of the current shift. `shifts`: start times in the time zone of `now`."""
+    """Start of the current shift. `shifts`: start times in the time zone of this computer, whose
+    offset may have changed since the shift began.
+    """
+    today = now.astimezone().date()
     starts = (
-        datetime.combine(now.date() - timedelta(days=days), each, now.tzinfo)
+        local_moment(datetime.combine(today - timedelta(days=days), each))
         for each in shifts
         for days in (0, 1)
     )
@@ -44,9 +47,7 @@ def shift_began(shifts: Iterable[time], now: datetime) -> datetime | None:
 
 
 class ShiftCounts:
-    """Counts the runs of the current shift. `shifts`: start times in the time zone of the times
-    that its methods get.
-    """
+    """Counts the runs of the current shift. `shifts`: as for `shift_began`."""
 
     def __init__(self, shifts: Sequence[time] = DEFAULT_SHIFTS) -> None:
         self._shifts = shifts

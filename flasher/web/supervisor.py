@@ -52,6 +52,7 @@ from flasher.station.records.model import (
     RunState,
     StepName,
     UnitState,
+    local_moment,
 )
 from flasher.station.records.newest import PageCursor
 from flasher.station.records.overview import HOLDERS_COUNTED, By, Overview, Page
@@ -558,7 +559,7 @@ def moment_in(question: Question, name: str) -> datetime | None:
         return None
     moment = None
     with suppress(ValueError, OverflowError):
-        moment = datetime.fromisoformat(text).astimezone()
+        moment = local_moment(datetime.fromisoformat(text))
     if moment is None or moment.year not in YEARS:
         first, last = YEARS[0], YEARS[-1]
         raise UsageError(
@@ -643,13 +644,15 @@ def spans_of(whole: Span) -> Iterator[Span]:
             )
             for count in range(SPANS_MAX)
         )
-    yield from _between((start.astimezone() for start in starts), whole.end)
+    yield from _between(map(local_moment, starts), whole.end)
 
 
 def _between(starts: Iterable[datetime], end: datetime) -> Iterator[Span]:
     """Spans from each start to the next, up to the one that contains `end`."""
     before: datetime | None = None
     for start in starts:
+        if start == before:
+            continue  # an hour that summer time leaves out
         if before is not None:
             yield Span(before, start)
             if start >= end:
@@ -667,7 +670,7 @@ def shifts_of(whole: Span, shifts: Sequence[time]) -> Iterator[tuple[Span, str]]
         for each in sorted(shifts)
     ]
     for begin, end in pairwise(starts):
-        span = Span(begin.astimezone(), end.astimezone())
+        span = Span(local_moment(begin), local_moment(end))
         if span.end > whole.begin and span.begin < whole.end:
             yield span, f"{begin:%H:%M}"
 

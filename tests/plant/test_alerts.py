@@ -17,6 +17,7 @@ from flasher.plant.stations import StationStatus
 from flasher.station.health import LITTLE_BYTES
 from flasher.station.records.model import RunState, Units, utc_text
 from tests.plant.factory import READER, Plant, Sender
+from tests.zones import in_zone
 
 NOW = datetime(2026, 5, 17, 12, 0, tzinfo=UTC)
 GOOD = StationStatus(
@@ -159,7 +160,11 @@ def test_yield_and_last_runs_are_those_of_each_station(plant: Plant, sender: Sen
     for each in (sender, other):
         each.send()
     other.close()
-    with closing(Central(plant.url(READER))) as central, central.reading() as connection:
+    with (
+        in_zone("UTC"),
+        closing(Central(plant.url(READER))) as central,
+        central.reading() as connection,
+    ):
         found = activities(connection, [time(10)], NOW, 2)
         night = activities(connection, [time(8)], NOW + timedelta(hours=13), 1)["line-3"]
         (two, three) = overviews(connection, BOUNDS, [time(6)], NOW)

@@ -35,8 +35,10 @@ from flasher.station.shift_counts import DEFAULT_SHIFTS
 from flasher.web import supervisor
 from flasher.web.query_processes import Answer, Question
 from flasher.web.supervisor import SupervisorPages, open_supervisor, shifts_of, spans_of
+from tests.loops import each
 from tests.station.factory import BMS_VERSION, IMAGES, Bench
 from tests.web.answering import app_of, app_with, client_of
+from tests.zones import in_zone
 
 IMAGE = IMAGES[TARGET].sha256
 HOSTILE = "<script>alert(1)</script>\u202e\x07" + "W" * 150
@@ -408,6 +410,25 @@ def test_spans_cover_a_time_without_gaps(days: int, count: int) -> None:
     assert spans[-1].end >= whole.end
     assert all(one.end == other.begin for one, other in pairwise(spans))
     assert count <= len(spans) <= count + 2
+
+
+@each(
+    "zone, begin, hours",
+    [
+        ("Europe/Berlin", "2026-03-28T23:00Z", "00 01 03"),
+        ("Europe/Berlin", "2026-10-24T22:00Z", "00 01 02"),
+        ("Australia/Lord_Howe", "2026-10-03T13:30Z", "00 01 02 03"),
+        ("America/Santiago", "2026-09-06T03:00Z", "23 01 02"),
+    ],
+)
+def test_hours_and_days_in_which_the_clock_is_changed(zone: str, begin: str, hours: str) -> None:
+    with in_zone(zone):
+        at = datetime.fromisoformat(begin)
+        spans = list(spans_of(Span(at, at + timedelta(hours=3))))
+        assert " ".join(f"{span.begin.astimezone():%H}" for span in spans) == hours
+        assert all(one.end == other.begin for one, other in pairwise(spans))
+        days = list(spans_of(Span(at, at + timedelta(days=5))))
+        assert len({span.begin.astimezone().date() for span in days}) == len(days)
 
 
 def test_shifts_cover_a_time_and_are_named_by_their_begin() -> None:

@@ -38,6 +38,7 @@ from flasher.station.records.model import (
     StepRecord,
     UnitLife,
     WriteRecord,
+    local_moment,
 )
 from flasher.station.records.store import Store
 from flasher.station.reports import TWICE_MAX, Report
@@ -110,7 +111,7 @@ def moment_of(text: str | None, option: str) -> datetime | None:
     if text is None:
         return None
     try:
-        return datetime.fromisoformat(text).astimezone()
+        return local_moment(datetime.fromisoformat(text))
     except (ValueError, OverflowError) as error:
         raise UsageError(
             f"{text!a:.40} is not a time.",

@@ -417,7 +417,7 @@ class Claiming:
             )
         )
         last = self._connection.execute(query).scalar_one()
-        if is_due(rule, utc_moment(last) if last else None, self._now.astimezone()):
+        if is_due(rule, utc_moment(last) if last else None, self._now):
             raise ClaimRefusedError(
                 Refusal.GOLDEN_DUE,
                 text("A golden unit has to pass on socket {socket} first.", socket=order.socket),
@@ -491,7 +491,7 @@ class Claiming:
 
 def is_due(rule: Golden, last_pass: datetime | None, now: datetime) -> bool:
     """True if a golden unit has to pass before the next run. `last_pass` is the time of the last
-    golden PASS on this socket; `now` is in the local time zone, in which shifts start.
+    golden PASS on this socket.
     """
     if last_pass is None:
         return True

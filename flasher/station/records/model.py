@@ -41,6 +41,16 @@ def utc_text(moment: datetime) -> str:
     return moment.astimezone(UTC).isoformat(timespec="microseconds").removesuffix("+00:00") + "Z"
 
 
+def local_moment(time: datetime) -> datetime:
+    """The moment of a time, which without a time zone is one of this computer's clock. A time that
+    the clock leaves out, since summer time begins, counts from the hour before: `astimezone` takes
+    it for an earlier moment, and for a midnight that is one of the day before.
+    """
+    if time.tzinfo is None:
+        time = datetime.fromtimestamp(time.timestamp(), UTC)
+    return time.astimezone()
+
+
 class UtcTextInJson:
     """Writes a time as `utc_text` in JSON: a time without microseconds is no shorter."""
 

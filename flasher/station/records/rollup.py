@@ -37,6 +37,7 @@ from flasher.station.records.model import (
     RunState,
     StepState,
     Units,
+    local_moment,
     utc_moment,
     utc_text,
 )
@@ -424,7 +425,7 @@ class _Days:
         """Add the local day of a time; after a change of the time zone, what other days leave."""
         date = utc_moment(begun_at).astimezone().date()
         begin, end = (
-            utc_text(datetime.combine(each, time()).astimezone())
+            utc_text(local_moment(datetime.combine(each, time())))
             for each in (date, date + timedelta(days=1))
         )
         at = bisect_right(self._begins, begun_at)

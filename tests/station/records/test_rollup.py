@@ -20,17 +20,18 @@ from flasher.station.records import rollup, schema
 from flasher.station.records.chain import FINISHED
 from flasher.station.records.database import Database, locate
 from flasher.station.records.errors import RecordError
-from flasher.station.records.model import RunFilter, RunKind, RunState, utc_text
+from flasher.station.records.model import RunFilter, RunKind, RunState, utc_moment, utc_text
 from flasher.station.records.overview import By, Overview
-from flasher.station.records.rollup import Rollup
+from flasher.station.records.rollup import Rollup, _Days
 from flasher.station.records.store import Store
 from flasher.station.records.yields import Span
 from flasher.station.shift_counts import DEFAULT_SHIFTS
 from flasher.web.supervisor import shifts_of, spans_of
-from tests.loops import sample
+from tests.loops import each, sample
 from tests.plant.factory import Plant
 from tests.station.factory import Bench
 from tests.station.postgres import OWNER
+from tests.zones import in_zone
 
 BEGIN = datetime(2026, 3, 27, 20, tzinfo=UTC)
 """Before a night in which clocks are set forward in Europe, and a month ends."""
@@ -247,8 +248,8 @@ def of_a_plant(request: pytest.FixtureRequest, folder: Path) -> Iterator[Databas
 
 def add_up(lines: Lines, now: datetime = NOW) -> None:
     sums = Rollup(lines.database)
-    for each in (now, now + rollup._ARRIVAL):  # at first a server's audit rows have to settle
-        while sums.add(each):
+    for at in (now, now + rollup._ARRIVAL):  # at first a server's audit rows have to settle
+        while sums.add(at):
             pass
 
 
@@ -298,6 +299,23 @@ def test_runs_that_arrive_late_are_added_to_the_days_that_they_touch(
         add_up(lines)
         assert summed(lines) == lines.runs
         check(lines)
+
+
+@each(
+    "zone, begun_at",
+    [
+        ("America/Santiago", "2026-09-06T03:30:00.000000Z"),
+        ("Europe/Berlin", "2026-03-29T00:59:59.999999Z"),
+        ("Europe/Berlin", "2026-10-25T23:00:00.000000Z"),
+        ("Australia/Lord_Howe", "2026-10-03T15:15:00.000000Z"),
+    ],
+)
+def test_a_run_is_in_its_day_when_the_clock_is_changed(zone: str, begun_at: str) -> None:
+    """In Santiago the day of the change has no midnight."""
+    with in_zone(zone):
+        days = _Days([])
+        for moment in (begun_at, utc_text(utc_moment(begun_at) + timedelta(hours=25))):
+            assert days.make(moment) == days.of(moment)
 
 
 @pytest.mark.slow

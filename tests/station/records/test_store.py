@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from datetime import UTC, datetime, time, timedelta
 from typing import Any
 
@@ -28,8 +29,10 @@ from flasher.station.records.model import (
     UnitState,
     Verified,
 )
-from flasher.station.shift_counts import shift_began
+from flasher.station.shift_counts import ShiftCounts, shift_began
+from tests.loops import each
 from tests.station.factory import BMS_VERSION, SERIAL, USUAL, Bench
+from tests.zones import in_zone
 
 GOLDEN = '\n[golden]\nserial_numbers = ["W2600001"]\nevery_h = 8\n'
 
@@ -247,6 +250,36 @@ def test_shifts_start_by_the_clock_on_the_wall() -> None:
     assert is_due(rule, None, at(17, 5))
     assert not is_due(rule, at(16, 23), at(17, 5))
     assert is_due(rule, at(16, 23), at(17, 6))
+
+
+@each(
+    "zone, now, began, hour",
+    [
+        ("Europe/Berlin", "2026-03-29T03:30Z", "2026-03-28T21:00Z", "2026-03-29T03:00Z"),
+        ("Europe/Berlin", "2026-03-29T04:00Z", "2026-03-29T04:00Z", "2026-03-29T04:00Z"),
+        ("Europe/Berlin", "2026-10-25T00:30Z", "2026-10-24T20:00Z", "2026-10-25T00:00Z"),
+        ("Europe/Berlin", "2026-10-25T01:30Z", "2026-10-24T20:00Z", "2026-10-25T01:00Z"),
+        ("Europe/Berlin", "2026-10-25T04:59Z", "2026-10-24T20:00Z", "2026-10-25T04:00Z"),
+        ("Australia/Lord_Howe", "2026-04-04T19:00Z", "2026-04-04T11:00Z", "2026-04-04T18:30Z"),
+        ("Australia/Lord_Howe", "2026-10-03T18:00Z", "2026-10-03T11:30Z", "2026-10-03T18:00Z"),
+    ],
+)
+def test_a_shift_begins_at_its_local_time_though_the_offset_changes_in_it(
+    bench: Bench, zone: str, now: str, began: str, hour: str
+) -> None:
+    at, begin = datetime.fromisoformat(now), datetime.fromisoformat(began)
+    run = next(iter(bench.store.read.table()), None) or bench.store.read.run(bench.make()).run
+    with in_zone(zone):
+        shifts = (time(6), time(22))
+        assert shift_began(shifts, at) == begin
+        rule = Golden(serial_numbers=("G",), shift_starts=shifts)
+        assert not is_due(rule, begin, at)
+        assert is_due(rule, begin - timedelta(minutes=1), at)
+        counts = ShiftCounts(shifts)
+        for moment in (begin, begin - timedelta(seconds=1), datetime.fromisoformat(hour)):
+            counts.add(replace(run, serial=str(moment), ended_at=moment))
+        figures = counts.output(at.astimezone())
+    assert (figures.hour.good, figures.shift.good) == (1, 1 if began == hour else 2)
 
 
 # -- the station dies -----------------------------------------------------------------------------
