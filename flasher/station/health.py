@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Final
 
@@ -16,6 +16,8 @@ LITTLE_BYTES: Final = 500 * 1024 * 1024
 """Less free disk space than this is reported."""
 CLOCK_SHIFT_MAX_S: Final = 5.0
 """Greatest change of UTC relative to the monotonic clock since the start of the station."""
+CERTIFICATE_LEFT: Final = timedelta(days=30)
+"""A certificate that expires sooner is reported."""
 LOOK_EVERY_S: Final = 5.0
 
 
@@ -29,11 +31,22 @@ class HealthCheck:
     """Result for people."""
 
 
+def certificate_checks(ends_at: datetime | None, now: datetime) -> tuple[HealthCheck, ...]:
+    """Check the certificate of the pages, which ends at `ends_at`; nothing if it is good."""
+    if ends_at is None or ends_at - now >= CERTIFICATE_LEFT:
+        return ()
+    date = f"{ends_at:%Y-%m-%d}"
+    sentence = text("expires on {date}: renew it, then start this again", date=date)
+    if ends_at <= now:
+        sentence = text("expired on {date}: renew it, then start this again", date=date)
+    return (HealthCheck(text("certificate"), is_good=False, text=sentence),)
+
+
 class HealthWatch:
     """Checks the health of a station; disk and clock every `LOOK_EVERY_S`.
 
     `folder`: the files of the records; `utc` and `monotonic_s`: the clocks; `unkept` returns the
-    places that lack the last chain heads. `plant` checks the sending of records to a plant.
+    places that lack the last chain heads. `more` makes further checks, with those of the disk.
     """
 
     def __init__(
@@ -42,9 +55,9 @@ class HealthWatch:
         utc: Callable[[], datetime],
         monotonic_s: Callable[[], float],
         unkept: Callable[[], Collection[str]] = tuple,
-        plant: Callable[[], Collection[HealthCheck]] = tuple,
+        more: Callable[[], Collection[HealthCheck]] = tuple,
     ) -> None:
-        self._plant = plant
+        self._more = more
         self._unkept = unkept
         self._folder = folder
         self._utc = utc
@@ -58,7 +71,7 @@ class HealthWatch:
         now = self._monotonic_s()
         if now - self._looked_at >= LOOK_EVERY_S:
             self._looked_at = now
-            self._seen = (*self._plant(), self._disk(), self._clock())
+            self._seen = (*self._more(), self._disk(), self._clock())
         sentence = board.records_fault or text("every run is saved")
         checks = [HealthCheck(text("records"), is_good=not board.records_fault, text=sentence)]
         if board.unprinted:

@@ -25,6 +25,7 @@ from flasher.cli.station.pages import OperatorView
 from flasher.errors import ExitCode, UsageError
 from flasher.station.board import Board
 from flasher.station.events import StationEvent
+from flasher.station.health import HealthWatch
 from flasher.station.records.errors import DiskFullError
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import RunKind, RunState
@@ -38,6 +39,7 @@ from tests.loops import each
 from tests.station.factory import USUAL, Bench, make_recipe
 from tests.station.line_bench import LineBench
 from tests.station.line_inputs import saved
+from tests.station.test_question import certificate
 
 pytestmark = pytest.mark.slow
 
@@ -198,6 +200,26 @@ def test_a_key_that_is_none_is_refused(flasher: Flasher, tmp_path: Path) -> None
     run = flasher(*RUN, "--units", "1", "--web", "0", "--web-key", key, "--web-certificate", RECIPE)
     assert run.code == ExitCode.USAGE
     assert "cannot be used" in run.err
+
+
+@each("days, words", [(-1, "expired on"), (3, "expires on"), (400, "")])
+def test_a_certificate_that_has_expired_or_soon_will_is_reported(
+    flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, days: int, words: str
+) -> None:
+    watches: list[HealthWatch] = []
+
+    class Kept(HealthWatch):
+        def __init__(self, *given: Any, **named: Any) -> None:
+            super().__init__(*given, **named)
+            watches.append(self)
+
+    monkeypatch.setattr(pages, "HealthWatch", Kept)
+    pem = certificate(tmp_path, f"line{days}", days)
+    pem.chmod(0o600)
+    run = flasher(*RUN, "--units", "1", "--web", "0", "--web-key", pem, "--web-certificate", pem)
+    assert (f"The certificate of the pages {words} 20" in run.err) is bool(words)
+    found = [check.text for check in watches[0].look(Board()) if check.name == "certificate"]
+    assert [text.startswith(words) for text in found] == [True] * bool(words)
 
 
 def test_a_port_that_is_taken_is_reported(flasher: Flasher) -> None:

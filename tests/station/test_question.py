@@ -210,7 +210,7 @@ def test_no_server(tmp_path: Path) -> None:
 # -- TLS -------------------------------------------------------------------------------------------
 
 
-def certificate(folder: Path, name: str) -> Path:
+def certificate(folder: Path, name: str, days: int = 1) -> Path:
     """A certificate that signs itself, with its key in one file."""
     key = ec.generate_private_key(ec.SECP256R1())
     now, named = datetime.now(UTC), x509.Name([x509.NameAttribute(x509.OID_COMMON_NAME, name)])
@@ -220,8 +220,8 @@ def certificate(folder: Path, name: str) -> Path:
         .issuer_name(named)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(now - timedelta(days=1))
-        .not_valid_after(now + timedelta(days=1))
+        .not_valid_before(now - timedelta(days=99))
+        .not_valid_after(now + timedelta(days=days))
         .add_extension(x509.SubjectAlternativeName([x509.DNSName(name)]), critical=False)
         .sign(key, hashes.SHA256())
     )

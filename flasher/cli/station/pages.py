@@ -12,8 +12,8 @@ import socket
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import Executor
-from contextlib import closing, contextmanager
-from datetime import datetime
+from contextlib import closing, contextmanager, suppress
+from datetime import UTC, datetime
 from datetime import time as dtime
 from functools import partial
 from pathlib import Path
@@ -34,7 +34,7 @@ from flasher.protocol.text import printable
 from flasher.station.board import Board
 from flasher.station.config import StationConfig, load_config
 from flasher.station.events import RunEnded, StationEvent
-from flasher.station.health import HealthCheck, HealthWatch
+from flasher.station.health import HealthCheck, HealthWatch, certificate_checks
 from flasher.station.operators import BADGES, Person
 from flasher.station.pins import checker
 from flasher.station.records.keys import KeyLocations
@@ -61,6 +61,7 @@ _TURN_S: Final = 0.1
 PASSWORD_MIN: Final = 8
 _PASSWORD_FILE_MAX_SIZE: Final = 4096
 """Bytes."""
+_CERTIFICATE_MAX_SIZE: Final = 1024 * 1024
 _ANY: Final = frozenset({"0.0.0.0", "::"})  # noqa: S104  compared, not bound
 _SECRET_MAX_SIZE: Final = 200
 _LOG: Final = logging.getLogger("flasher.web")
@@ -125,13 +126,16 @@ def operator_page(
     for run in store.read.table(RunFilter(since=began)):
         if run.station == store.station and run.state is not RunState.RUNNING:
             tally.add(run)
-    clock = station.clock
+    clock, ends_at = station.clock, certificate_end(options)
     watch = HealthWatch(
         store.files.folder,
         clock.utc,
         clock.monotonic_s,
         store.signer.unkept,
-        partial(_plant_checks, station) if config.plant else tuple,
+        lambda: (
+            *certificate_checks(ends_at, clock.utc()),
+            *(_plant_checks(station) if config.plant else ()),
+        ),
     )
     screen = Screen(tally, watch)
     pages = Pages(options.language)
@@ -217,6 +221,8 @@ def serve(
     ):
         answering.begin()
         output.progress(f"The supervisor pages: {url}; Ctrl-C ends them")
+        for check in certificate_checks(certificate_end(pages), datetime.now(UTC)):
+            output.progress(f"The {check.name} of the pages {check.text}.")
         while not stopped():
             time.sleep(_TURN_S)
     return ExitCode.OK
@@ -315,6 +321,20 @@ def _tls(options: PagesOptions) -> Tls | None:
         return None
     check_secret(key, "the key of the pages")
     return Tls(certificate, key)
+
+
+def certificate_end(options: PagesOptions) -> datetime | None:
+    """Time at which the certificate of the pages expires; None without one. `Server` reports a file
+    that is none.
+    """
+    if options.web_certificate is None:
+        return None
+    from cryptography import x509  # noqa: PLC0415  it takes a while
+
+    data = read(options.web_certificate, _CERTIFICATE_MAX_SIZE, what="certificate")
+    with suppress(ValueError):
+        return x509.load_pem_x509_certificate(data).not_valid_after_utc
+    return None
 
 
 def _password(options: PagesOptions) -> str:
