@@ -185,7 +185,7 @@ class UpgradeStage:
         # State that outlives an attempt.
         self._at = _Attempt()
         self._attempt = 1
-        self._heard_at = -inf
+        self._received_at = -inf
         """Time at which the device last sent something, or may have while the adapter was lost."""
         self._update_left_at = -inf
         """Time at which the last update command was sent."""
@@ -287,8 +287,8 @@ class UpgradeStage:
     @property
     def _has_begun(self) -> bool:
         """True if a device that had sent something got an update command."""
-        was_heard = self._last_boot is not None or self._erased
-        return was_heard and self._update_was_sent
+        has_answered = self._last_boot is not None or self._erased
+        return has_answered and self._update_was_sent
 
     @property
     def _boot_timeout_s(self) -> float:
@@ -331,7 +331,7 @@ class UpgradeStage:
             except LinkRestored as restored:
                 self._at.unobserved_s += restored.away_s if self._is_updating else 0.0
                 self._tx.abandon(self._run.now + self._timings.inter_frame_timeout_s * DROP_MARGIN)
-                self._heard_at = self._run.now  # it may have sent something meanwhile
+                self._received_at = self._run.now  # it may have sent something meanwhile
                 self._dispatch(UpgradeEvent.LINK_BACK)
             except SecondToolSeen as tool:
                 # Send nothing more, not even the rest of a message.
@@ -369,7 +369,7 @@ class UpgradeStage:
                 self._message(came)
 
     def _message(self, message: Message) -> None:
-        self._heard_at = self._run.now
+        self._received_at = self._run.now
         if self._duplicates.evidence and not self.is_yielding:
             self._dispatch(UpgradeEvent.TWO_DEVICES)
             return
@@ -377,8 +377,8 @@ class UpgradeStage:
         if item is not None and message[:3] == (item.can_id, item.mode, item.command):
             self._dispatch(UpgradeEvent.VERSION, item.content.from_data(message.data))
             return
-        row = decode(message)
-        event = _EVENTS.get(type(row), UpgradeEvent.UNEXPECTED)
+        content = decode(message)
+        event = _EVENTS.get(type(content), UpgradeEvent.UNEXPECTED)
         if event is UpgradeEvent.FEEDBACK:
             self._at.feedback_came, self.in_session = True, False
             if not self._update_was_sent:
@@ -388,9 +388,9 @@ class UpgradeStage:
                 self._other_answer = self._other_answer or feedback
         elif event is UpgradeEvent.NAK:
             self._naks += 1
-        self._dispatch(event, row)
+        self._dispatch(event, content)
 
-    def _dispatch(self, event: UpgradeEvent, row: ReceivedContent = None) -> None:
+    def _dispatch(self, event: UpgradeEvent, content: ReceivedContent = None) -> None:
         if self._ending is not None:
             self._finish()
             return
@@ -398,7 +398,7 @@ class UpgradeStage:
         move = TABLE[before].get(event)
         if move is None:
             raise RuntimeError(f"{event} cannot happen in {before}")
-        self._actions[move.action](row)
+        self._actions[move.action](content)
         reached = self._state_or_ending
         if reached is not before and reached not in move.leads_to:
             raise RuntimeError(f"{event} led from {before} to {reached}")
@@ -420,11 +420,11 @@ class UpgradeStage:
 
     # -- what is sent, and the timers that start when it has left ---------------------------------
 
-    def _send(self, row: UpgradeMessage, not_before: float = 0.0) -> None:
+    def _send(self, content: UpgradeMessage, not_before: float = 0.0) -> None:
         request_id = self._plan.target.request_id
-        frames = split(request_id, encode(row.to_message(request_id)))
+        frames = split(request_id, encode(content.to_message(request_id)))
         self._timer_at = inf
-        self._run.send(frames, not_before=not_before, tag=row.COMMAND)
+        self._run.send(frames, not_before=not_before, tag=content.COMMAND)
 
     def _send_reset(self) -> None:
         """Send the reset, the documented one or the product's own."""
@@ -500,12 +500,12 @@ class UpgradeStage:
 
     # -- actions: anywhere -----------------------------------------------------------------------
 
-    def _ignore(self, row: ReceivedContent) -> None:
+    def _ignore(self, content: ReceivedContent) -> None:
         pass
 
-    def _report(self, row: ReceivedContent, what: str = UpgradeEvent.UNEXPECTED.value) -> None:
+    def _report(self, content: ReceivedContent, what: str = UpgradeEvent.UNEXPECTED.value) -> None:
         """Report an unexpected message."""
-        match row:
+        match content:
             case Malformed(message, problem):
                 what = f"message {message.command:04X} from {message.can_id:03X} ignored: {problem}"
             case Unknown(message):
@@ -513,22 +513,22 @@ class UpgradeStage:
             case BootVersion(name, version):
                 what += f": {printable(name)} {printable(version)}"
             case Ack(number) | Nak(number):
-                what += f": {type(row).__name__.upper()} {number}"
+                what += f": {type(content).__name__.upper()} {number}"
         self._run.emit(events.Reported(what))
 
-    def _fail(self, ending: Ending, row: ReceivedContent, reason: Reason) -> None:
+    def _fail(self, ending: Ending, content: ReceivedContent, reason: Reason) -> None:
         """Begin another attempt, or end the upgrade if none is left."""
         if self._is_last_attempt:
-            self._end(ending, row)
+            self._end(ending, content)
             return
         if self._failure is None or ending not in _SILENT:
-            self._failure = (ending, row)  # later silence is less informative
+            self._failure = (ending, content)  # later silence is less informative
         if reason in _FROM_THE_UPDATE:
-            self._start_over(row, reason)
+            self._start_over(content, reason)
         else:
-            self._begin_again(row, reason)
+            self._begin_again(content, reason)
 
-    def _begin_again(self, row: ReceivedContent, reason: Reason = Reason.LINK_BACK) -> None:
+    def _begin_again(self, content: ReceivedContent, reason: Reason = Reason.LINK_BACK) -> None:
         """Begin another attempt with the reset."""
         if self.state is UpgradeState.RESETTING and self.goes_on:
             self._send_reset()  # this attempt has not begun
@@ -537,12 +537,12 @@ class UpgradeStage:
         self._enter(UpgradeState.RESETTING)
         self._send_reset()
 
-    def _start_over(self, row: ReceivedContent, reason: Reason) -> None:
+    def _start_over(self, content: ReceivedContent, reason: Reason) -> None:
         """Begin another attempt with the update command: the device is in its bootloader."""
         self._next_attempt(reason)
-        if isinstance(row, BootVersion):
-            self._note_boot(row)
-        if row is None:
+        if isinstance(content, BootVersion):
+            self._note_boot(content)
+        if content is None:
             self._enter(UpgradeState.AWAITING_REQUEST)
             self._send_update()
         else:
@@ -560,19 +560,19 @@ class UpgradeStage:
         self._repetitions += 1
         self._run.emit(events.MessageRepeated(what, reason.value, tries))
 
-    def _restarted(self, row: BootVersion | RequestTransfer, reason: Reason) -> None:
+    def _restarted(self, content: BootVersion | RequestTransfer, reason: Reason) -> None:
         """Handle a device that restarted during the transfer."""
-        self._fail(Ending.RESTARTED, row, reason)
+        self._fail(Ending.RESTARTED, content, reason)
 
     # -- actions: up to the update command --------------------------------------------------------
 
-    def _repeat_reset(self, row: ReceivedContent) -> None:
+    def _repeat_reset(self, content: ReceivedContent) -> None:
         if self._run.now - self._state_since >= self._timings.command_timeout_s:
-            self._await_boot(row)
+            self._await_boot(content)
         else:
             self._send_reset()
 
-    def _await_boot(self, row: ReceivedContent) -> None:
+    def _await_boot(self, content: ReceivedContent) -> None:
         self._enter(UpgradeState.AWAITING_BOOT)
         self._wait_for_boot()
 
@@ -580,18 +580,18 @@ class UpgradeStage:
         self._tx.drop_unstarted()
         wait_s = self._boot_timeout_s
         self._timer_at = max(self._run.now, self._tx.left_at) + wait_s
-        is_silent = self._silence_was_answered and self._heard_at < self._update_left_at
+        is_silent = self._silence_was_answered and self._received_at < self._update_left_at
         if is_silent and self.goes_on:
             self._run.emit(events.PowerCycleAwaited(self._deadline_at - self._run.now))
         elif self._asks_for_power and self.announcement is None:
             self._run.emit(events.PowerCycleAwaited(wait_s))
 
-    def _wait_or_begin_again(self, row: ReceivedContent) -> None:
+    def _wait_or_begin_again(self, content: ReceivedContent) -> None:
         """Send nothing to a device that has not sent a boot version at power-up."""
         if self._asks_for_power and not self._has_begun:
             self._wait_for_boot()
         else:
-            self._begin_again(row)
+            self._begin_again(content)
 
     def _take_boot(self, boot: BootVersion) -> None:
         number = boot_version_number(boot.version)
@@ -631,17 +631,17 @@ class UpgradeStage:
         in_burst_s = 2.5 * self._timings.boot_version_spacing_s
         return max(self._timings.boot_watch_s, min(2 * self._slowest_answer_s, in_burst_s))
 
-    def _watch_on(self, row: BootVersion | GeneralFeedbackMessage) -> None:
+    def _watch_on(self, content: BootVersion | GeneralFeedbackMessage) -> None:
         now, timings, at = self._run.now, self._timings, self._at
-        if isinstance(row, BootVersion) and self._is_foreign(row):
-            self._end(Ending.WRONG_DEVICE, row)
+        if isinstance(content, BootVersion) and self._is_foreign(content):
+            self._end(Ending.WRONG_DEVICE, content)
             return
         answer_id = self._plan.target.answer_id
         if not self._duplicates.application_beside and not self._duplicates.has_announced(
             answer_id
         ):
             # Announcements before the reset have ended: an application is present and restarts.
-            self._await_boot(row)
+            self._await_boot(content)
             return
         if self._duplicates.application_beside:
             wait_s = timings.boot_version_timeout_s
@@ -652,7 +652,7 @@ class UpgradeStage:
         if self._tx.idle:
             self._timer_at = min(at.watched_until, now + timings.burst_s)
 
-    def _answer_boot(self, row: ReceivedContent) -> None:
+    def _answer_boot(self, content: ReceivedContent) -> None:
         """Send the update command, as there is no evidence of a second device."""
         at = self._at
         has_ended = self._run.now < at.watched_until
@@ -678,17 +678,17 @@ class UpgradeStage:
         version, minimum = printable(boot.version), self._options.minimum_boot_version
         self._run.emit(events.BootVersionSeen(printable(boot.name), version))
         if minimum is not None:
-            text = f"the bootloader {version} is not older than {minimum}, as the manifest asks"
-            self._run.emit(events.CheckMade("boot-version", "passed", text))
+            what = f"the bootloader {version} is not older than {minimum}, as the manifest asks"
+            self._run.emit(events.CheckMade("boot-version", "passed", what))
 
-    def _miss_boot(self, row: ReceivedContent) -> None:
+    def _miss_boot(self, content: ReceivedContent) -> None:
         """Handle a missing boot version; an interrupted transfer gets an update command (R26)."""
         if self.in_session or (self._has_begun and not self._is_last_attempt):
-            silent_since = max(self._heard_at, self._update_left_at, self._began_at)
+            silent_since = max(self._received_at, self._update_left_at, self._began_at)
             erased_at = silent_since + self._timings.request_transfer_timeout_s
             was_tried = self._at.feedback_came or self._silence_was_answered
             if was_tried and not self.goes_on and not self.in_session:
-                self._fail(self._silent_ending, row, Reason.BOOT_GIVEN_UP)
+                self._fail(self._silent_ending, content, Reason.BOOT_GIVEN_UP)
             elif self._run.now < erased_at:
                 self._timer_at = erased_at
             else:
@@ -696,12 +696,12 @@ class UpgradeStage:
                 # into the silence, once, or after each erase limit if nothing can be lost.
                 self._silence_was_answered = True
                 self._attempts += self.in_session
-                self._fail(self._silent_ending, row, Reason.BOOT_SILENT)
+                self._fail(self._silent_ending, content, Reason.BOOT_SILENT)
         elif self._options.at_power_up and self._silent_ending is Ending.NO_BOOT_VERSION:
             self._asks_for_power = True
             self._wait_for_boot()
         else:
-            self._end(self._silent_ending, row)
+            self._end(self._silent_ending, content)
 
     @property
     def _silent_ending(self) -> Ending:
@@ -730,19 +730,19 @@ class UpgradeStage:
     def _send_update_again(self, boot: BootVersion) -> None:
         first_at, limit_s = self._at.first_update_left_at, self._timings.request_transfer_timeout_s
         if first_at is not None and self._run.now - first_at > limit_s:
-            self._miss_hearing(boot)
+            self._update_ignored(boot)
         else:
             self._note_boot(boot)
             self._send_update()
 
-    def _miss_hearing(self, boot: BootVersion) -> None:
+    def _update_ignored(self, boot: BootVersion) -> None:
         """Handle a device that sends boot versions for the whole erase limit."""
         if self._erased:
             self._fail(Ending.UNHEARING, boot, Reason.REQUEST_GIVEN_UP)
         else:
             self._end(Ending.UNHEARING, boot)
 
-    def _miss_request(self, row: ReceivedContent) -> None:
+    def _miss_request(self, content: ReceivedContent) -> None:
         announced = self._at.announced_meanwhile
         if announced is not None:
             # It may be the last one of a device that listens after its announcement only.
@@ -750,32 +750,32 @@ class UpgradeStage:
         elif not self._has_begun and self._asks_for_power:
             self._attempts += 1
             self._next_attempt(Reason.REQUEST_GIVEN_UP)
-            self._await_boot(row)
+            self._await_boot(content)
         elif not self._has_begun:
-            self._end(Ending.NO_BOOT_VERSION, row, "nor an answer to the update command")
+            self._end(Ending.NO_BOOT_VERSION, content, "nor an answer to the update command")
         else:
             is_silent = self._failed_packet is not None and self._at.boot is None
             ending = Ending.PACKET_FAILED if is_silent else Ending.NO_REQUEST
-            self._fail(ending, row, Reason.REQUEST_GIVEN_UP)
+            self._fail(ending, content, Reason.REQUEST_GIVEN_UP)
 
-    def _await_request_or_begin_again(self, row: ReceivedContent) -> None:
+    def _await_request_or_begin_again(self, content: ReceivedContent) -> None:
         if self._is_updating:
             timeout_s = self._timings.request_transfer_timeout_s
             self._at.announced_meanwhile = None  # the device may have begun to erase since
             self._timer_at = self._update_left_at + timeout_s
         else:
-            self._begin_again(row)
+            self._begin_again(content)
 
-    def _send_first_packet(self, row: ReceivedContent) -> None:
+    def _send_first_packet(self, content: ReceivedContent) -> None:
         if self._at.first_update_left_at is None:
-            self._report(row)  # late answer to another update command
+            self._report(content)  # late answer to another update command
             return
         self._enter(UpgradeState.TRANSFERRING)
         self._tx.drop_unstarted()
         minimum = self._options.minimum_boot_version
         if minimum is not None and not self._has_begun:
-            text = f"no boot version in an open session; the manifest asks for {minimum}"
-            self._run.emit(events.CheckMade("boot-version", "unknown", text))
+            what = f"no boot version in an open session; the manifest asks for {minimum}"
+            self._run.emit(events.CheckMade("boot-version", "unknown", what))
         self.unchecked = None
         self._at.request_at = self._run.now
         self._erasures += 1
@@ -829,11 +829,11 @@ class UpgradeStage:
         else:
             self._settle(answer)
 
-    def _settle(self, row: ReceivedContent) -> None:
+    def _settle(self, content: ReceivedContent) -> None:
         """Continue once every copy of the packet was answered, or the wait for answers ended."""
         at, total = self._at, self._plan.total_packets
         if not at.accepted:
-            self._repeat_packet(row, Reason.PACKET_REFUSED)
+            self._repeat_packet(content, Reason.PACKET_REFUSED)
             return
         self._acknowledged = at.packet
         self._tx.limit_left_at(self._run.now)
@@ -847,45 +847,45 @@ class UpgradeStage:
         at.end_tries += 1
         self._send(EndOfTransfer(), self._after_packet_gap())
 
-    def _miss_answer(self, row: ReceivedContent) -> None:
+    def _miss_answer(self, content: ReceivedContent) -> None:
         self._timeouts += 1
-        self._repeat_packet(row, Reason.PACKET_UNANSWERED)
+        self._repeat_packet(content, Reason.PACKET_UNANSWERED)
 
-    def _repeat_packet(self, row: ReceivedContent, reason: Reason) -> None:
+    def _repeat_packet(self, content: ReceivedContent, reason: Reason) -> None:
         """Send the packet again while a try is left."""
         if self._is_last_try:
-            self._packet_lost(row)
+            self._packet_lost(content)
             return
         self._enter(UpgradeState.TRANSFERRING)
         self._send_packet()
         self._repeated(f"packet {self._at.packet}", reason, self._at.tries)
 
-    def _packet_lost(self, row: ReceivedContent) -> None:
-        self._fail(Ending.PACKET_FAILED, row, Reason.PACKET_GIVEN_UP)
+    def _packet_lost(self, content: ReceivedContent) -> None:
+        self._fail(Ending.PACKET_FAILED, content, Reason.PACKET_GIVEN_UP)
 
-    def _resend_packet(self, row: ReceivedContent) -> None:
+    def _resend_packet(self, content: ReceivedContent) -> None:
         self._send_packet()
         self._repeated(f"packet {self._at.packet}", Reason.LINK_BACK, self._at.tries)
 
-    def _await_quiet(self, row: ReceivedContent) -> None:
+    def _await_quiet(self, content: ReceivedContent) -> None:
         self._enter(UpgradeState.SETTLING)
         # While a copy is being sent, the time starts at its end (see _message_left).
         if self._tx.idle:
             quiet_s = self._timings.quiet_after_repeat_s
             self._timer_at = max(self._run.now, self._tx.left_at) + quiet_s
 
-    def _take_late_request(self, row: RequestTransfer) -> None:
+    def _take_late_request(self, content: RequestTransfer) -> None:
         """Handle request transfer during the transfer (R16)."""
         if self._at.packet > 1 or self._at.accepted:
-            self._restarted(row, Reason.REQUEST_LATE)
+            self._restarted(content, Reason.REQUEST_LATE)
         elif not self._tx.idle:
-            self._await_quiet(row)
+            self._await_quiet(content)
         elif self._is_last_try:
-            self._packet_lost(row)
+            self._packet_lost(content)
         elif self.state is UpgradeState.SETTLING:
-            self._await_quiet(row)
+            self._await_quiet(content)
         else:
-            self._repeat_packet(row, Reason.REQUEST_AGAIN)
+            self._repeat_packet(content, Reason.REQUEST_AGAIN)
 
     def _take_boot_in_transfer(self, boot: BootVersion) -> None:
         """Handle a boot version during the transfer: left over, or from a restart (R11)."""
@@ -917,24 +917,24 @@ class UpgradeStage:
         self._repeated("end of transfer", reason, self._at.end_tries)
         self._send(EndOfTransfer())
 
-    def _resend_end(self, row: ReceivedContent) -> None:
+    def _resend_end(self, content: ReceivedContent) -> None:
         self._repeat_end(Reason.LINK_BACK)
 
-    def _miss_end(self, row: ReceivedContent) -> None:
+    def _miss_end(self, content: ReceivedContent) -> None:
         is_announcing = self._at.announcing.has_begun
         self._timeouts += not is_announcing
         if not is_announcing and self._at.end_tries < self._timings.end_tries:
             self._repeat_end(Reason.END_UNANSWERED)
         elif self._version_item is None:
-            self._end(Ending.UNCONFIRMED, row)
+            self._end(Ending.UNCONFIRMED, content)
         else:
             self._enter(UpgradeState.CONFIRMING)
             self._run.listen(self._version_item.can_id)
-            self._query_version(row)
+            self._query_version(content)
 
-    def _complete(self, row: ReceivedContent) -> None:
+    def _complete(self, content: ReceivedContent) -> None:
         has_sent_end = self._at.end_copies_left > 0
-        self._end(Ending.COMPLETED if has_sent_end else Ending.BROKEN_PROTOCOL, row)
+        self._end(Ending.COMPLETED if has_sent_end else Ending.BROKEN_PROTOCOL, content)
 
     def _take_boot_after_end(self, boot: BootVersion) -> None:
         """Handle boot versions after end of transfer: one burst comes from the start of the new
@@ -958,7 +958,7 @@ class UpgradeStage:
             self._timer_at = now + self._timings.burst_s
             self._report(boot, "boot version after end of transfer")
 
-    def _query_version(self, row: ReceivedContent) -> None:
+    def _query_version(self, content: ReceivedContent) -> None:
         request = self._options.version_request_for(self._plan.target)
         if request is None:
             raise RuntimeError("the table asks for a version without a version query")
@@ -966,12 +966,12 @@ class UpgradeStage:
         self._timer_at = inf
         self._run.send(split(query.can_id, encode(query)), tag=Command.READ_VERSION)
 
-    def _miss_version(self, row: ReceivedContent) -> None:
+    def _miss_version(self, content: ReceivedContent) -> None:
         asked_s = self._run.now - self._state_since
         if asked_s >= self._timings.application_start_timeout_s:
-            self._end(Ending.UNCONFIRMED, row)
+            self._end(Ending.UNCONFIRMED, content)
         else:
-            self._query_version(row)
+            self._query_version(content)
 
     def _judge_version(self, answer: Content) -> None:
         other = other_unit(answer, self.serial_before)
@@ -989,7 +989,7 @@ class UpgradeStage:
 
     # -- actions: beside another tool -------------------------------------------------------------
 
-    def _yield_or_end(self, row: ReceivedContent) -> None:
+    def _yield_or_end(self, content: ReceivedContent) -> None:
         """Handle another tool that writes. A device without application is upgraded again when that
         tool is silent; one that may be complete, or untouched, is left to the user.
         """
@@ -997,49 +997,49 @@ class UpgradeStage:
         is_erased_perhaps = self._update_was_sent and not is_complete_perhaps
         may_wait = self._options.waits_for_other_tool and not self._is_last_attempt
         if not (is_erased_perhaps and may_wait):
-            self._end(Ending.SECOND_TOOL, row, self._second_tool)
+            self._end(Ending.SECOND_TOOL, content, self._second_tool)
             return
         if not self.is_yielding:
             self._run.emit(events.SecondToolAwaited(self._second_tool, OTHER_TOOL_QUIET_S))
         self._enter(UpgradeState.YIELDING)
-        self._yield_on(row)
+        self._yield_on(content)
 
-    def _yield_on(self, row: ReceivedContent) -> None:
+    def _yield_on(self, content: ReceivedContent) -> None:
         self._timer_at = self._run.now + OTHER_TOOL_QUIET_S
 
-    def _take_turn(self, row: ReceivedContent) -> None:
+    def _take_turn(self, content: ReceivedContent) -> None:
         self._run.duplicates = DuplicateDetector(
             self._timings
         )  # earlier answers were for the other tool
-        self._fail(Ending.SECOND_TOOL, row, Reason.SECOND_TOOL)
+        self._fail(Ending.SECOND_TOOL, content, Reason.SECOND_TOOL)
 
     # -- the end ---------------------------------------------------------------------------------
 
-    def _end_broken(self, row: ReceivedContent) -> None:
-        self._end(Ending.BROKEN_PROTOCOL, row)
+    def _end_broken(self, content: ReceivedContent) -> None:
+        self._end(Ending.BROKEN_PROTOCOL, content)
 
-    def _end_for_two_devices(self, row: ReceivedContent) -> None:
-        self._end(Ending.TWO_DEVICES, row, self._duplicates.evidence)
+    def _end_for_two_devices(self, content: ReceivedContent) -> None:
+        self._end(Ending.TWO_DEVICES, content, self._duplicates.evidence)
 
-    def _end_out_of_time(self, row: ReceivedContent) -> None:
+    def _end_out_of_time(self, content: ReceivedContent) -> None:
         """End like an earlier attempt if only retries without risk followed it."""
         ending = Ending.OUT_OF_TIME
         if self.is_yielding:
             ending = Ending.SECOND_TOOL
         elif self._failure is not None and self._attempt > self._attempts:
-            ending, row = self._failure
+            ending, content = self._failure
         if ending is Ending.SECOND_TOOL:
-            self._end(ending, row, self._second_tool)
+            self._end(ending, content, self._second_tool)
         else:
-            self._end(ending, row)
+            self._end(ending, content)
 
-    def _end_cancelled(self, row: ReceivedContent) -> None:
-        self._end(Ending.CANCELLED, row)
+    def _end_cancelled(self, content: ReceivedContent) -> None:
+        self._end(Ending.CANCELLED, content)
 
-    def _end(self, ending: Ending, row: ReceivedContent, detail: str = "") -> None:
+    def _end(self, ending: Ending, content: ReceivedContent, detail: str = "") -> None:
         """End the upgrade as soon as a partly sent message is complete; device text is escaped."""
-        if isinstance(row, BootVersion):
-            detail = f"boot version {printable(row.name)!r} {printable(row.version)!r}"
+        if isinstance(content, BootVersion):
+            detail = f"boot version {printable(content.name)!r} {printable(content.version)!r}"
         elif self._was_answered_otherwise(ending):
             detail = self._other_answer
         elif ending is Ending.PACKET_FAILED and self._phase is not Phase.TRANSFER:
