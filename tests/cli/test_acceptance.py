@@ -222,6 +222,16 @@ def test_a_target_without_queries_that_sends_nothing_is_upgraded_all_the_same(
     assert states(run.document)["identity afterwards"] == "not possible"
 
 
+def test_a_battery_that_answers_all_but_its_version_has_no_identity(
+    walk: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(DeviceInfo, "version", None)
+    run = walk("--yes", "--json")
+    assert run.code == 12
+    assert states(run.document)["identity"] == "failed"
+    assert states(run.document)["first upgrade"] == "not tried"
+
+
 @pytest.mark.slow
 def test_a_check_of_the_device_that_refuses_names_no_option_to_waive_it(
     walk: Callable[..., Run], tmp_path: Path

@@ -13,6 +13,7 @@ import click
 import pytest
 
 from flasher import events
+from flasher.cli.upgrade import acceptance
 from flasher.cli.upgrade.choices import repair_command
 from flasher.errors import ExitCode
 from flasher.events import Phase
@@ -158,6 +159,19 @@ def test_a_refused_image_is_not_named_again_nor_what_was_reported_about_it(
     repair_of: Callable[..., str], typed: str, repair: str
 ) -> None:
     assert repair_of(typed, is_refused=True) == f"flasher {repair}"
+
+
+def test_a_refused_image_is_not_named_again_by_an_acceptance(
+    flasher: Flasher, stage: Stage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(acceptance._Walk, "_look_at_bus", lambda _walk: "")
+    stage.device.profile = replace(SMALL, image_checksum="crc32")
+    image = tmp_path / "bad.bin"
+    image.write_bytes(IMAGE.data)
+    words = ("--yes", "--force", "-o", tmp_path / "report.html", "-i", "virtual")
+    failed = flasher("acceptance", image, "-t", "bms", *words)
+    assert failed.code == ExitCode.REFUSED
+    assert repair_named_in(failed.err) == ["rescue", "OTHER_IMAGE", "-t", "bms", "-i", "virtual"]
 
 
 def test_after_a_refusal_the_one_command_can_be_right_and_spares_the_evidence(

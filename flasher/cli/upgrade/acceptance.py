@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import json
-import shlex
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
@@ -20,7 +19,7 @@ from flasher.cli import values
 from flasher.cli.adapters import choose_adapter
 from flasher.cli.documents import ImageDocument
 from flasher.cli.files import check_new, check_not_read, claimed, write_whole
-from flasher.cli.framework import command, option, rebuild_command_line
+from flasher.cli.framework import command, option
 from flasher.cli.look.doctor import LISTEN_S, Diagnostics
 from flasher.cli.look.findings import Severity
 from flasher.cli.options import (
@@ -36,7 +35,7 @@ from flasher.cli.recording import Recording, RecordingOptions
 from flasher.cli.stop import Stop, stop_on_signal
 from flasher.cli.terminal import agrees, can_ask
 from flasher.cli.upgrade import text
-from flasher.cli.upgrade.choices import EXIT_CODES
+from flasher.cli.upgrade.choices import EXIT_CODES, repair_command
 from flasher.cli.upgrade.progress import Progress
 from flasher.cli.upgrade.upgrade_run import UpgradeRun
 from flasher.documents import as_json
@@ -313,6 +312,8 @@ class _Walk:
             return "it sent nothing, and the documents give no query for it: a reset will show it"
         rows = [] if found.version is None else content_fields(found.version)
         self._details += [f"{each.label}: {each.text}" for each in rows]
+        if not rows and found.readings:
+            raise _StepError(f"the {node} does not answer the query for its identity")
         if not rows:
             return "it sends; the documents give no query for its identity"
         shown = "; ".join(self._details)
@@ -429,9 +430,9 @@ class _Walk:
         """
         error.remedy = error.remedy.replace(AGAIN, _AGAIN)
         if error.needs_rescue and not self.bus.mock:
+            is_refused = error.exit_code is ExitCode.REFUSED
             ctx = click.get_current_context()
-            words = rebuild_command_line(ctx, "rescue", without=_OWN_OPTIONS.__contains__)
-            error.command = shlex.join(["flasher", *words])
+            error.command = repair_command(ctx, is_refused=is_refused, without=_OWN_OPTIONS)
 
     def _interrupt_and_rescue(self, connection: api.Connection) -> str:
         job, total = self.job, self.job.plan.total_packets

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Collection
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
@@ -219,14 +220,21 @@ def image_again(ctx: click.Context) -> dict[str, str]:
     return {"image": SAME_IMAGE} if ctx.params["image"] == STANDARD_INPUT else {}
 
 
-def repair_command(ctx: click.Context, *, is_refused: bool, of_set: SetImage | None = None) -> str:
+def repair_command(
+    ctx: click.Context,
+    *,
+    is_refused: bool,
+    of_set: SetImage | None = None,
+    without: Collection[str] = (),
+) -> str:
     """Return the `flasher rescue` command for the command of `ctx`, quoted for a shell. Options
-    about an image that the device refused are omitted. `of_set` is the image of a bike's device.
+    about an image that the device refused are omitted. `of_set` is the image of a bike's device,
+    `without` are options of the command that a rescue does not have.
     """
 
     def is_left_out(name: str) -> bool:
         of_the_image = name in _OF_THE_IMAGE or name.startswith("--allow-")
-        return name in _LEFT_OUT or (is_refused and of_the_image)
+        return name in _LEFT_OUT or name in without or (is_refused and of_the_image)
 
     image = image_again(ctx) if of_set is None else {"image": str(of_set.path)}
     replaced = {"image": OTHER_IMAGE} if is_refused else image
