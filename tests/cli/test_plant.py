@@ -259,7 +259,7 @@ def test_a_server_that_is_away_is_named_without_the_password(flasher: Flasher) -
     ("of", "cause"),
     [
         ("flasher_line_2:wrong", 'password authentication failed for user "flasher_line_2"'),
-        ("no-one:x", 'password authentication failed for user "nobody"'),
+        ("no-one:x", 'password authentication failed for user "no-one"'),
         ("flasher_line_2", "no password supplied"),
     ],
 )
