@@ -96,6 +96,8 @@ class HttpTransport(Transport):
             # The limit of the whole attempt is that of `send`.
             timeout=httpx2.Timeout(receiver.time_limit_s, connect=receiver.time_limit_s / 2),
             trust_env=False,  # a proxy of this user's shell is no part of the settings
+            # An answer that is late or sent twice must not be taken for that of the next document.
+            limits=httpx2.Limits(max_keepalive_connections=0),
         )
 
     async def close(self) -> None:

@@ -210,12 +210,15 @@ def test_a_unit_that_passes_at_both_pcs_is_named(
     sender.bench.make(serial="W2605001")
     sender.send()
     taken(plant, key)
-    sender.bench.make(serial="W2605009")
+    labelled = sender.bench.make(serial="W2605009", gets_label=True)
+    sender.bench.store.note(AuditEvent.LABELLED, {}, labelled)
+    sender.bench.make(serial="W2605008", gets_label=True)
     spares.append(spare := spare_of(plant, sender))
     spare.bench.make(serial="W2605009")
     assert brought(spare, sender.bench.path).conflicts == ("W2605009",)
     sender.bench.make(serial="W2605010")  # the old PC still runs
     assert len(brought(spare, sender.bench.path).runs) == 1
+    assert [run.serial for run in spare.bench.store.read.unlabelled("line-2")] == ["W2605008"]
     spare.send()
     assert not examined(plant).problems
 

@@ -6,6 +6,7 @@ import asyncio
 import ssl
 import subprocess
 from collections.abc import Iterator
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from ipaddress import IPv4Address
 from pathlib import Path
@@ -192,3 +193,32 @@ def test_http_with_tls_and_a_password(secrets: Path) -> None:
     assert answer == Answer(DeliveryState.CONFIRMED, "HTTP 201")
     assert receiver.authorization == "Basic Zmxhc2hlcjpzM2NyM3Q="
     assert list(receiver.documents) == [KEY]
+
+
+def test_an_acknowledgement_that_comes_late_or_twice_is_not_for_the_next_run() -> None:
+    """Each document has a connection of its own: HTTP has nothing that names the request."""
+    ok, busy = (f"HTTP/1.1 {status}\r\ncontent-length: 0\r\n\r\n".encode() for status in (200, 503))
+
+    writers: list[asyncio.StreamWriter] = []
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writers.append(writer)
+        with suppress(asyncio.IncompleteReadError):
+            await reader.readuntil(DOCUMENT)
+            writer.write(busy)
+            await reader.readuntil(DOCUMENT)
+            writer.write(ok + busy)  # the first one is for the document before
+
+    async def deliver() -> list[Answer]:
+        async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
+            port = server.sockets[0].getsockname()[1]
+            chosen = {"name": "mes", "url": f"http://127.0.0.1:{port}/runs", "time_limit_s": 20.0}
+            transport = transport_to(Settings.model_validate(chosen))
+            answers = [await transport.send(f"{KEY}{run}", DOCUMENT) for run in range(2)]
+            await transport.close()
+            for writer in writers:
+                writer.close()
+                await writer.wait_closed()
+        return answers
+
+    assert asyncio.run(deliver()) == [Answer(DeliveryState.UNKNOWN, "HTTP 503")] * 2

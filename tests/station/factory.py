@@ -256,12 +256,14 @@ class Bench:
         reason: str = "",
         code: str = "",
         is_virtual: bool = False,
+        gets_label: bool = False,
     ) -> RunId:
         """A whole run."""
         claim = self.claim(serial, socket, lot=lot, reason=reason, is_virtual=is_virtual)
         run_id = claim.run_id
         self.work(run_id)
         code = code or ("OK" if state is RunState.PASS else "NO_ANSWER")
-        self.store.finish(run_id, self.ending(state, code, self.traced(serial)))
+        ending = self.ending(state, code, self.traced(serial))
+        self.store.finish(run_id, ending, gets_label=gets_label)
         self.clock.go_on(2.0)
         return run_id
