@@ -9,8 +9,8 @@ from typing import Final
 SUFFIX: Final = ".pyz"
 """File name ending of the build in one file, which a Python runs."""
 _START: Final = "flasher_start"
-"""Module that the build in one file begins with. Somebody else's file with flasher in it does not,
-and would begin itself anew for each process.
+"""Module that the build in one file begins with. Another file that contains flasher does not,
+and would start itself again for each process.
 """
 
 

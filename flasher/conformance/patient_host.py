@@ -192,7 +192,7 @@ class PatientHost:
         limit_s = limit("first_version_s")
         first_s = min(_BLIND_S, limit_s) if blind else limit_s
         if blind and self._profile.choice("up_08") == "starts_over":
-            first_s = 0.0  # in a transfer it begins anew; otherwise a boot version follows
+            first_s = 0.0  # in a transfer it starts over; otherwise a boot version follows
         reply = self._tester.wait_for(Reply.BOOT_VERSION, within_s=first_s)
         for _ in range(UPDATES_MAX):
             if reply is None and not blind:

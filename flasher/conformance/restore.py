@@ -126,7 +126,7 @@ def needs_power(profile: ConformanceProfile) -> bool:
 
 
 def _limit_s(subject: Subject, profile: ConformanceProfile) -> float:
-    """Time limit of one attempt, each of whose upgrades may begin anew three times."""
+    """Time limit of one attempt, each of whose upgrades may start over three times."""
     waits = Waits(profile, subject.port.bitrate_bps)
     return 3 * _UPGRADE_TRIES * waits.upgrade_s(len(subject.good_image)) + _MARGIN_S
 

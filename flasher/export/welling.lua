@@ -577,7 +577,7 @@ local function follow(bus, item)
   if item.kind == "message" then connect(bus, item) end
 end
 
--- A message that begins inside another one on the tool's id: two tools speak.
+-- A message that begins inside another one on the tool's id: two tools send.
 local function is_cut_in(bus, id, payload, now)
   local state = bus.cut_in[id]
   if not state then

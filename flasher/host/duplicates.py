@@ -469,7 +469,7 @@ class DuplicateDetector:
 
     def _alternate(self, rhythm: Collection[tuple[float, bool]], *, is_documented: bool) -> bool:
         """True if the last four boot versions come from two bootloaders. One that is twice as fast
-        as documented has equal intervals; one may begin its burst anew at an update command.
+        as documented has equal intervals; one may restart its burst at an update command.
         """
         times = [each for each, _ in rhythm]
         if len(times) < 4 or not all(

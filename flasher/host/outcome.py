@@ -312,7 +312,7 @@ _EXPLANATIONS: Final = {
     ),
     Ending.NOT_TRUSTED: ErrorDescription(
         WrongDeviceError,
-        "an older release than the device has received: faults that were mended would come back",
+        "an older release than the device has received: faults that were fixed would come back",
         "Take the newest release of the maker.",
         code=ErrorCode.NOT_TRUSTED,
     ),
@@ -344,7 +344,7 @@ _EXPLANATIONS: Final = {
     ),
     Ending.SECOND_TOOL: ErrorDescription(
         BusError,
-        "another program or dongle speaks as the CAN dongle (CDL) on this bus",
+        "another program or dongle sends as the CAN dongle (CDL) on this bus",
         "End the other tool and disconnect it. {again}",
         code=ErrorCode.SECOND_TOOL,
     ),

@@ -107,7 +107,7 @@ _EXPLANATIONS: Final = {
     ),
     Verdict.SECOND_TOOL: ErrorDescription(
         BusError,
-        "another program or dongle speaks as the CAN dongle (CDL) on this bus",
+        "another program or dongle sends as the CAN dongle (CDL) on this bus",
         "End the other tool, then look at the device with flasher info.",
         code=ErrorCode.SECOND_TOOL,
     ),
@@ -334,7 +334,7 @@ def _judge_version(
 def _note_boot_versions(
     run: Runner[Any], target: Target, announcing: Announcing
 ) -> Callable[[StageInput], StageInput]:
-    """Return a function that notes boot versions among the inputs of a query. It begins anew after
+    """Return a function that notes boot versions among the inputs of a query. It starts over after
     a pause of this computer: those that are read then were sent at an unknown time.
     """
     input_at = run.now

@@ -42,7 +42,7 @@ OF_DEVICE: Final[Mapping[str, Waiver]] = {
     ),
     "downgrade": Waiver(
         text("an image that is older than what runs"),
-        text("Faults that were mended come back, and newer settings may not be understood."),
+        text("Faults that were fixed come back, and newer settings may not be understood."),
     ),
     "previous-version": Waiver(
         text("a running version that the manifest does not replace"),

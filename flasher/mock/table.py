@@ -103,7 +103,7 @@ TABLE: Final[Mapping[BootloaderState, _Row]] = {
         _E.QUERY: BootloaderTransition("answer"),
         _E.UPGRADE_IN_APPLICATION: BootloaderTransition("send_feedback"),
     },
-    # Deaf: a second reset does not restart it twice (RS-02).
+    # Receives nothing: a second reset does not restart it twice (RS-02).
     _S.RESTARTING: _POWERED | {_E.RESTART_DUE: _BOOTED},
     # Announces and listens, then listens for the window.
     _S.ANNOUNCING: _IN_BOOTLOADER | {

@@ -93,7 +93,7 @@ class Announcing:
         self.count += 1
 
     def forget(self) -> None:
-        """Begin anew."""
+        """Start over."""
         self.first_at, self.last_at, self._longest_pause_s = inf, -inf, 0.0
 
     @property

@@ -286,7 +286,7 @@ class IndependentDevice:
         frames = frames_of(self._says_id if can_id is None else can_id, REPORT, command, data)
         self._outbox.extend((now + self._choices.late, frame) for frame in frames)
 
-    # -- what it hears ---------------------------------------------------------------------------
+    # -- what it receives ------------------------------------------------------------------------
 
     def _hear(self, mode: int, command: int, data: bytes, now: float) -> None:
         if self.state in ("application", "starting"):

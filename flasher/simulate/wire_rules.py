@@ -103,7 +103,7 @@ class WireRules:
         self.begin_run()
 
     def begin_run(self) -> None:
-        """Begin with another process of the host, which knows nothing of the one before."""
+        """Begin with another process of the host, without the state of the one before."""
         self._left = self._update_left = 0
         self.has_update = False
         """A whole update command was sent."""

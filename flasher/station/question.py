@@ -114,7 +114,7 @@ class Question:
                 made = self._tls.wrap_socket(
                     plain, server_hostname=host, do_handshake_on_connect=False
                 )
-            # The time limit of a socket starts anew with each byte: this one ends all of them.
+            # The time limit of a socket starts again with each byte: this one ends all of them.
             watch = threading.Timer(_left_s(ends_at_s), _shut, (made,))
             watch.daemon = True
             watch.start()

@@ -25,7 +25,7 @@ def upgrade_bike(bench: BenchController, selection: str) -> None:
     """Check the whole bike, then upgrade the devices of the selected set in a safe order; begun
     again, it goes on where it stopped.
 
-    Raises UsageError if the page was outdated, and FlasherError for what speaks against the
+    Raises UsageError if the page was outdated, and FlasherError for what refuses the
     upgrade; the error of an upgrade that has begun is in its `done`.
     """
     chosen = bench.shown_offer(selection)

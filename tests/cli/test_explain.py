@@ -186,7 +186,7 @@ def test_a_trace_of_the_conformance_suite_is_no_second_tool(
     """It breaks the protocol on purpose: a reset and a query in the midst of a transfer."""
     tape = Tape().to_packet(4).ack(4).tool(0x3300, b"", mode=0x11).packet(5).ack(5).reset()
     plain = tape.feedback().boot().save(tmp_path / "plain.log")
-    assert "verdict: two tools speak on the bus" in flasher("explain", plain).out
+    assert "verdict: two tools send on the bus" in flasher("explain", plain).out
     ran = flasher(
         "conformance", "-t", "bms", "--mock", "--trace-dir", tmp_path, "--case", "TX-13",
         "--variant", "reset-in-transfer-hangs",

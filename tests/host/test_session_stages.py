@@ -109,7 +109,7 @@ def test_a_second_tool_ends_the_session_in_every_stage_and_not_one_frame_more_is
     if phase in BEFORE_ERASE:
         assert result.outcome.device_left is DeviceLeft.UNTOUCHED
     if phase == VERIFICATION:
-        assert "completed, but a second tool speaks" in error.what
+        assert "completed, but a second tool sends" in error.what
         assert wording(DeviceLeft.UNKNOWN) in error.remedy
 
 
