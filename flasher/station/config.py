@@ -243,6 +243,14 @@ class StationConfig(TomlTable):
             raise ValueError("heads contains an empty place")
         return value
 
+    @field_validator("shifts")
+    @classmethod
+    def _check_shifts(cls, value: tuple[time, ...]) -> tuple[time, ...]:
+        if any(start.tzinfo is not None for start in value):
+            raise ValueError("shifts are local times, without a time zone")
+        no_two("shifts", "start", [f"{start:%H:%M}" for start in value])
+        return value
+
     @model_validator(mode="after")
     def _check_plant(self) -> StationConfig:
         if self.plant_recipes and not (self.plant and self.badges):

@@ -92,9 +92,10 @@ def test_all_that_the_options_choose_is_sent_again_and_listed_up_to_the_limit(de
     assert [line for line in run.out.splitlines() if " to mes" in line] == [
         "W2605013, PASS, line-2: waiting to mes"
     ]
-    begun = ("deliveries", "--state", "waiting", "--since", "2026-05-17T00:00Z")
+    waiting = ("deliveries", "--state", "waiting")
+    begun = (*waiting, "--since", "2026-05-17T00:00Z")
     assert len(desk.run(*begun, role=READER).document["deliveries"]) == 2
-    assert desk.run(*begun, "--until", "2026-05-17T00:00Z").document["deliveries"] == []
+    assert desk.run(*waiting, "--until", "2026-05-17T00:00Z").document["deliveries"] == []
 
 
 def test_what_is_posted_is_the_document_that_the_schema_describes(desk: Desk) -> None:

@@ -535,6 +535,9 @@ def test_a_report_can_be_narrowed(flasher: Flasher, plant: Path) -> None:
     wrong = flasher(*words, "--since", "yesterday")
     assert wrong.code == ExitCode.USAGE
     assert wrong.document["error"]["where"] == "--since"
+    for until in ("2026-05-16", "2026-05-17"):
+        empty = flasher(*words, "--since", "2026-05-17", "--until", until)
+        assert (empty.code, empty.document["error"]["where"]) == (ExitCode.USAGE, "--until")
 
 
 @pytest.mark.slow

@@ -106,6 +106,8 @@ def test_the_heads_are_kept_in_one_place_or_in_several(tmp_path: Path) -> None:
             "two sockets have the same adapter",
         ),
         ("interface = ", 'serial_number = "x"\ninterface = ', "cannot be used|TOML"),
+        ('name = "line-2"', 'name = "line-2"\nshifts = ["06:00Z"]', "without a time zone"),
+        ('name = "line-2"', 'name = "line-2"\nshifts = ["06:00", "06:00"]', "the same start"),
     ],
 )
 def test_what_is_wrong_with_a_station_file_is_named(

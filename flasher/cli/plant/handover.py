@@ -12,7 +12,7 @@ from flasher.cli.extras import need
 from flasher.cli.output import Output, counted, utc_time
 from flasher.cli.plant.commands import DeliveryOptions
 from flasher.cli.plant.documents import PlantDeliverDocument, PlantDeliveriesDocument
-from flasher.cli.station.records import moment_of
+from flasher.cli.station.records import period_of
 from flasher.cli.stop import stop_on_signal
 from flasher.errors import ExitCode, UsageError
 from flasher.plant.central import open_central
@@ -77,14 +77,15 @@ def deliveries(
             "--resend would send every run again.",
             remedy="Choose which: --state refused, --serial SERIAL, --key KEY or --receiver NAME.",
         )
+    since, until = period_of(options.since, options.until)
     chosen = DeliveryFilter(
         receiver=options.receiver,
         state=None if options.state is None else DeliveryState(options.state),
         station=options.station,
         serial=options.serial,
         key=options.key,
-        since=moment_of(options.since, "--since"),
-        until=moment_of(options.until, "--until"),
+        since=since,
+        until=until,
     )
     with open_central(url) as central:
         found = Deliveries(central)

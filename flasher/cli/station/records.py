@@ -63,11 +63,12 @@ def report(
     }
     for option, (path, _) in wanted.items():
         check_writable(path, option)
+    since, until = period_of(options.since, options.until)
     chosen = RunFilter(
         lot=options.lot,
         recipe=options.recipe,
-        since=moment_of(options.since, "--since"),
-        until=moment_of(options.until, "--until"),
+        since=since,
+        until=until,
         serial=options.serial,
         part=options.part,
         station=options.station,
@@ -106,7 +107,20 @@ def _check_station(store: Store, station: str | None) -> None:
         )
 
 
-def moment_of(text: str | None, option: str) -> datetime | None:
+def period_of(since: str | None, until: str | None) -> tuple[datetime | None, datetime | None]:
+    """Parse the period of --since and --until. Raises UsageError."""
+    begin, end = _moment_of(since, "--since"), _moment_of(until, "--until")
+    if begin is not None and end is not None and end <= begin:
+        raise UsageError(
+            f"The period from {since!a} to {until!a} is empty.",
+            where="--until",
+            remedy="Give the first time that is no longer in it: for one day,"
+            " --since 2026-05-17 --until 2026-05-18.",
+        )
+    return begin, end
+
+
+def _moment_of(text: str | None, option: str) -> datetime | None:
     """Parse a time; it is local without a time zone. Raises UsageError."""
     if text is None:
         return None
