@@ -573,7 +573,7 @@ class BenchController:
                 remedy=text("Leave one unit connected until its upgrade has ended."),
                 code=ErrorCode.NOT_FOR_DEVICE,
             )
-            carried = replace(carried, error=error)
+            carried = replace(carried, result=None, error=error)  # no user has cancelled it
         if carried.error is not None:
             again = RESCUE if carried.error.needs_rescue else _AGAIN
             advise(carried.error, again, AGAIN)

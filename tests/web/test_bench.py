@@ -158,6 +158,7 @@ def test_another_bike_than_the_one_shown_gets_nothing(
     assert words in error.what
     assert not error.needs_rescue
     assert state.packet == 0
+    assert state.done is None or state.done.result is None, "no user has cancelled it"
 
 
 def test_the_next_bike_begins_with_nothing_of_the_last(place: BenchPlace) -> None:
