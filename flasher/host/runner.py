@@ -69,8 +69,8 @@ class Runner(Generic[T]):
         self.watch: Callable[[Frame], bool] | None = None
         """Called with every received frame; if it returns True, the stage does not get it."""
         self.duplicates = DuplicateDetector(timings)
-        self.tx.on_message_dropped = self.duplicates.message_dropped
         """Detects a second device."""
+        self.tx.on_message_dropped = self.duplicates.message_dropped
         self._make_stage = stage
         self._stage: Stage[T] | None = None
         self._wake_at = 0.0  # at once

@@ -2,7 +2,7 @@
 
     python -m tests.site
 
-holds that the answer is there, at most two clicks from the front page, by links in the text alone.
+checks that the answer is at most two clicks from the front page, by links in the text alone.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ CLICKS_MAX: Final = 2
 
 
 class Question(NamedTuple):
-    """Who asks what, where the answer is, and words that stand in it."""
+    """Who asks what, where the answer is, and words of the answer."""
 
     who: str
     asks: str
@@ -54,7 +54,7 @@ QUESTIONS: Final = (
         "service",
         "Does a flash keep odometer and settings?",
         "how-to/questions.html#does-a-flash-keep-odometer-and-settings",
-        "in it flasher writes no setting",
+        "flasher writes no setting in it",
     ),
     Question(
         "service",
@@ -76,8 +76,8 @@ QUESTIONS: Final = (
     ),
     Question(
         "line",
-        "How many sockets does a PC carry?",
-        "how-to/questions.html#how-many-sockets-does-a-pc-carry",
+        "How many sockets can a PC run?",
+        "how-to/questions.html#how-many-sockets-can-a-pc-run",
         "flasher sets no limit",
     ),
     Question(
