@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import datetime, time
+from datetime import UTC, datetime, time
 from typing import Any, Final
 
 from sqlalchemy import Connection, text
@@ -19,7 +19,7 @@ from flasher.station.records.model import (
     local_moment,
     utc_moment,
 )
-from flasher.station.records.yields import ALL_TIME, Span, units_in
+from flasher.station.records.yields import Span, units_in
 from flasher.station.shift_counts import shift_began
 from flasher.validation import json_keys
 
@@ -75,7 +75,7 @@ def activities(
     """
     day = local_moment(datetime.combine(now.astimezone(), time()))
     shift = shift_began(shifts, now) or day
-    spans = [Span(begin, ALL_TIME.end) for begin in (shift, day)]
+    spans = [Span(begin, datetime.max.replace(tzinfo=UTC)) for begin in (shift, day)]
     chosen = RunFilter(since=min(day, shift))
     yields = dict(units_in(connection, chosen, spans, by_station=True))
     sockets: dict[Any, dict[str, list[RecentRun]]] = defaultdict(lambda: defaultdict(list))

@@ -85,6 +85,7 @@ from flasher.station.records.model import (
     WriteId,
 )
 from flasher.station.records.store import Store, SystemClock
+from flasher.station.records.tally import Totals
 from flasher.station.runs import ActiveRun, save, with_history
 from flasher.station.scans import Refused, Word
 from flasher.station.socket import UNNAMED, Socket, SocketPhase, Source
@@ -197,7 +198,8 @@ class Station:
         self.checker = checker or pins.checker()
         """Executor for PIN checks."""
         self._wake_receiver, self._wake_sender = multiprocessing.Pipe(duplex=False)
-        self._started_at = self.clock.utc()
+        started = RunFilter(since=self.clock.utc(), station=self.store.station)
+        self._totals = Totals(self.store.database, started)
         self._is_stopping = False
         self._is_aborting = False
         self._is_open = False
@@ -401,8 +403,7 @@ class Station:
     @property
     def figures(self) -> Figures:
         """Totals of this station since it started. Raises RecordError."""
-        chosen = RunFilter(since=self._started_at, station=self.store.station)
-        return self.store.read.figures(chosen)
+        return self._totals.figures()
 
     # -- inputs and effects of the line -----------------------------------------------------------
 

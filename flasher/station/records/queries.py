@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import statistics
-from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import asdict
 from typing import Any, Final, TypeVar, cast
 
 from pydantic import ValidationError
-from sqlalchemy import Connection, Select, func, literal, select
+from sqlalchemy import Connection, Select, literal, select
 
 from flasher.documents import adapter
 from flasher.protocol.text import printable
@@ -17,7 +14,7 @@ from flasher.station.records import chain, schema
 from flasher.station.records.capability import Capability, capabilities
 from flasher.station.records.database import Database
 from flasher.station.records.errors import NotFoundError, RecordsDamagedError
-from flasher.station.records.filters import WITHOUT_CAUSE, counting, filtered
+from flasher.station.records.filters import filtered
 from flasher.station.records.heads import ChainHead
 from flasher.station.records.model import (
     DUPLICATES,
@@ -31,11 +28,10 @@ from flasher.station.records.model import (
     RunState,
     StepName,
     UnitLife,
-    Units,
     UnitState,
 )
-from flasher.station.records.rows import batches, beside_index
-from flasher.station.records.yields import ALL_TIME, units_in
+from flasher.station.records.rows import batches
+from flasher.station.records.tally import Tally, tallied
 
 _EVERYTHING: Final = RunFilter()
 _Row = TypeVar("_Row")
@@ -165,34 +161,11 @@ class Records:
         return found[0]
 
     def figures(self, chosen: RunFilter = _EVERYTHING) -> Figures:
-        run = schema.run.c
-        # Without their indexes, by which all runs would be read.
-        state, code = beside_index(run.state), beside_index(run.code)
-        ends = counting(chosen, state, code, run.is_virtual, func.count())
-        duration_s = run.ended_monotonic_s - run.begun_monotonic_s
-        passes = counting(chosen, duration_s).where(state == RunState.PASS.value)
-        by_state: Counter[RunState] = Counter()
-        failures: Counter[str] = Counter()
-        virtual_runs = 0
+        tally = Tally()
         with self._database.reading() as connection:
-            for ended, why, is_virtual, count in connection.execute(
-                ends.group_by(state, code, run.is_virtual)
-            ):
-                by_state[RunState(ended)] += count
-                virtual_runs += is_virtual * count
-                if ended not in WITHOUT_CAUSE:
-                    failures[why] += count
-            durations_s = connection.execute(passes).scalars().all()
-            units = dict(units_in(connection, chosen, [ALL_TIME]))
-        return Figures(
-            runs=by_state.total(),
-            **asdict(units.get((0, 0), Units())),
-            by_state=by_state,
-            virtual_runs=virtual_runs,
-            failures=dict(sorted(failures.items(), key=lambda item: (-item[1], item[0]))),
-            duration_median_s=statistics.median(durations_s) if durations_s else None,
-            duration_longest_s=max(durations_s, default=None),
-        )
+            for row in connection.execute(tallied(chosen)):
+                tally.add(row)
+        return tally.figures()
 
     def capabilities(self, chosen: RunFilter = _EVERYTHING) -> list[Capability]:
         """The measurements with limits of the runs of a filter."""

@@ -274,6 +274,15 @@ def _ends(after: int, until: int | None = None) -> Select[int]:
     return query if until is None else query.where(audit.id <= until)
 
 
+def ended_after(audit_id: int, chosen: RunFilter) -> Rest:
+    """Runs of a filter whose end is in a later audit row, or that go on."""
+    run = schema.run.c
+    running = select(run.id).where(run.state == RunState.RUNNING.value)
+    later = run.id.in_(union_all(_ends(audit_id), running))
+    within = begun_in(chosen, beside_index(run.begun_at))
+    return Rest(replace(chosen, since=None, until=None), [later, *within])
+
+
 def _save_state(sums: sqlite3.Connection, connection: Connection, added: _Added) -> None:
     """Identify the records and what was added. In a restored copy of the records that continued
     from there, the last audit row differs.
@@ -501,12 +510,8 @@ class Rolled:
 
     @property
     def tail(self) -> Rest:
-        """Runs that ended later, or go on."""
-        run = schema.run.c
-        running = select(run.id).where(run.state == RunState.RUNNING.value)
-        later = run.id.in_(union_all(_ends(self._added.audit), running))
-        within = begun_in(self.chosen, beside_index(run.begun_at))
-        return Rest(replace(self.chosen, since=None, until=None), [later, *within])
+        """Runs that are not in the sums."""
+        return ended_after(self._added.audit, self.chosen)
 
     def _cut(self, whole: Collection[Day]) -> Iterator[Rest]:
         """Runs of days that lie only partly in the period or in a span."""

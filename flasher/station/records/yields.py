@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any, Final
 
 from sqlalchemy import Connection, and_, case, func, literal, select, union_all
@@ -24,9 +24,6 @@ class Span:
 
     begin: datetime
     end: datetime
-
-
-ALL_TIME: Final = Span(datetime.min.replace(tzinfo=UTC), datetime.max.replace(tzinfo=UTC))
 
 
 def units_in(

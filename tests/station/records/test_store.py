@@ -29,6 +29,7 @@ from flasher.station.records.model import (
     UnitState,
     Verified,
 )
+from flasher.station.records.tally import Totals
 from flasher.station.shift_counts import ShiftCounts, shift_began
 from tests.loops import each
 from tests.station.factory import BMS_VERSION, SERIAL, USUAL, Bench
@@ -331,6 +332,32 @@ def test_a_connection_lost_in_a_transaction_leaves_the_run_as_it_was(bench: Benc
     assert bench.store.read.run(run_id).run.state is RunState.RUNNING
     bench.store.finish(run_id, bench.ending())
     assert not bench.store.examine().problems
+
+
+def test_totals_are_the_figures_of_all_runs_in_whatever_order_these_end(bench: Bench) -> None:
+    bench.make(RunState.PASS, "W2605001")
+    bench.clock.go_on(1)
+    chosen = RunFilter(since=bench.clock.utc(), station=bench.store.station)
+    totals = Totals(bench.store.database, chosen)
+
+    def check(runs: int) -> None:
+        found = totals.figures()
+        assert (found, found.runs) == (bench.store.read.figures(chosen), runs)
+
+    check(0)
+    slow = bench.claim("W2605002").run_id
+    bench.make(RunState.FAIL, "W2605003", "B")
+    check(2)
+    bench.work(slow)
+    bench.store.finish(slow, bench.ending(trace=bench.traced("W2605002")))
+    check(2)
+    bench.make(RunState.PASS, "W2605003", "B")
+    check(3)
+    check(3)
+    assert totals.figures().first_pass_share == 0.5
+    bench.claim("W2605004")
+    bench.store.end_unknown(())
+    check(4)
 
 
 @pytest.mark.slow
