@@ -171,20 +171,27 @@ def send_tcp(address: tuple[str, int], data: bytes, limit_s: float) -> None:
 
 
 def write_file(path: Path, data: bytes, limit_s: float) -> None:
-    """Append a label to a file, or write it to a device. Raises NotPrinted after the time limit."""
-    until = time.perf_counter() + limit_s
+    """Append a whole label to a file, or write it to a device. Raises NotPrinted after the time
+    limit.
+    """
+    until, size = time.perf_counter() + limit_s, len(data)
     flags = os.O_WRONLY | os.O_APPEND | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
     if not path.is_relative_to("/dev"):  # do not create a file for an unplugged device
         flags |= os.O_CREAT
     try:
         handle = os.open(path, flags, 0o644)
+        end = os.fstat(handle).st_size
         try:
             while data:
                 left_s = until - time.perf_counter()
                 if left_s <= 0 or not (_IS_WINDOWS or select.select([], [handle], [], left_s)[1]):
                     raise _too_slow(limit_s)
-                data = data[os.write(handle, data) :]
+                written = os.write(handle, data)
+                end, data = end + written, data[written:]
         finally:
+            with suppress(OSError):  # a device cannot be cut, and another program may add to a file
+                if data and os.fstat(handle).st_size == end:
+                    os.ftruncate(handle, end - (size - len(data)))
             os.close(handle)
     except OSError as error:
         raise _unreachable(error) from error

@@ -4,6 +4,7 @@ a command of the printer.
 
 from __future__ import annotations
 
+import errno
 import os
 import queue
 import socket
@@ -535,6 +536,27 @@ def test_a_file_and_a_device(tmp_path: Path) -> None:
     assert not Path("/dev/no-such-printer").exists()
     with pytest.raises(NotPrinted, match="cannot be reached"):
         printer_of(configured(printer=f"file:{tmp_path}"))(b"x", LIMIT_S)
+
+
+def test_a_disk_that_gets_full_leaves_no_half_label(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, write = tmp_path / "labels.zpl", os.write
+    send = printer_of(configured(printer=f"file:{path}"))
+    send(b"^XA^XZ", LIMIT_S)
+
+    def write_some(handle: int, data: bytes) -> int:
+        if data != b"^XA^FDone^XZ":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(handle, data[:5])
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", write_some)
+        with pytest.raises(NotPrinted, match="No space left"):
+            send(b"^XA^FDone^XZ", LIMIT_S)
+    assert path.read_bytes() == b"^XA^XZ"
+    send(b"^XA^FDone^XZ", LIMIT_S)
+    assert path.read_bytes() == b"^XA^XZ^XA^FDone^XZ"
 
 
 @pytest.mark.skipif(os.name == "nt", reason="pipes of POSIX")
