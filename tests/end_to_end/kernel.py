@@ -124,6 +124,13 @@ class Candlelights(Pair):
         found = _candlelights()
         self.tool, self.device = found.get(0, self.tool), found.get(1, self.device)
 
+    def plug_in_again(self, *numbers: int) -> None:
+        """Unplug both, and put these back: the first one gets the first name."""
+        for number in (0, 1):
+            self.unplug(number)
+        for number in numbers:
+            self.plug(number)
+
     def short(self, milliseconds: int) -> None:
         """Every frame fails for so long."""
         self.order(f"short {milliseconds}")

@@ -112,6 +112,69 @@ def test_an_adapter_that_stays_away_ends_the_flash_and_the_same_command_brings_t
     check_flash(bus, tmp_path)
 
 
+@pytest.fixture
+def in_order(bus: Candlelights) -> None:
+    """The tool's adapter has the first name."""
+    bus.plug_in_again(0, 1)
+    start(bus.tool)
+    start(bus.device)
+
+
+@pytest.mark.usefixtures("in_order", "device")
+def test_adapters_that_exchange_their_names_in_a_transfer_go_on_where_they_were(
+    bus: Candlelights, tmp_path: Path
+) -> None:
+    names = bus.tool, bus.device
+    with flashing(bus, tmp_path) as host:
+        bus.plug_in_again(1, 0)
+        assert (bus.device, bus.tool) == names
+        start(bus.device)
+        start(bus.tool)
+        assert host.end() == ExitCode.OK, host.reported
+    assert (tmp_path / "out.bin").read_bytes() == IMAGE
+
+
+@pytest.mark.usefixtures("in_order", "device")
+def test_another_adapter_of_the_same_name_is_not_gone_on_with(
+    bus: Candlelights, tmp_path: Path
+) -> None:
+    tool = bus.tool
+    with flashing(bus, tmp_path) as host:
+        bus.plug_in_again(1)
+        assert bus.device == tool
+        start(bus.device)
+        assert host.end() == ExitCode.BUS, host.reported
+    assert f"{tool} is the name of another adapter now" in host.stderr
+    bus.plug(0)
+    start(bus.tool)
+    check_flash(bus, tmp_path)
+
+
+@pytest.mark.usefixtures("device")
+def test_an_interface_that_was_taken_down_in_a_transfer_goes_on_when_it_is_up(
+    bus: Candlelights, tmp_path: Path
+) -> None:
+    with flashing(bus, tmp_path) as host:
+        root(f"ip link set {bus.tool} down")
+        host.until("for the adapter")
+        root(f"ip link set {bus.tool} up")
+        assert host.end() == ExitCode.OK, host.reported
+    assert (tmp_path / "out.bin").read_bytes() == IMAGE
+
+
+@pytest.mark.usefixtures("device")
+def test_an_interface_that_stays_down_ends_the_flash_with_the_command_that_starts_it(
+    bus: Candlelights, tmp_path: Path
+) -> None:
+    with flashing(bus, tmp_path) as host:
+        root(f"ip link set {bus.tool} down")
+        assert host.end() == ExitCode.BUS, host.reported
+    command = f"ip link set {bus.tool} up type can bitrate 250000"
+    assert f"`{command}`" in host.stderr, host.reported
+    root(command)
+    check_flash(bus, tmp_path)
+
+
 def test_the_device_model_outlives_its_adapter(
     bus: Candlelights, device: Device, tmp_path: Path
 ) -> None:
