@@ -63,7 +63,9 @@ def acquire(config: Mapping[str, Any], holder: str | None) -> Callable[[], None]
             f"{printable(name)} is in use by {_holder_of(path)}.",
             where="before the adapter was opened",
             cause="two tools on one bus disturb each other, and any upgrade",
-            remedy="Wait until it has ended, or end it; flasher monitor watches the bus meanwhile.",
+            remedy="Wait until it has ended, or end it."
+            if interface in _OPENED_ONCE
+            else "Wait until it has ended, or end it; flasher monitor watches the bus meanwhile.",
             code=ErrorCode.ADAPTER_IN_USE,
         ) from None
     except OSError as error:
