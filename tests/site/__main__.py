@@ -26,7 +26,7 @@ _DATE: Final = (1980, 1, 1, 0, 0, 0)
 """Of every file in the zip archive: the same pages make the same archive."""
 
 
-def build(folder: Path, *, jobs: str = "auto") -> bool:
+def build(folder: Path) -> bool:
     """Build it anew in place of a site that is there; whether Sphinx had nothing against it."""
     if folder.exists() and any(folder.iterdir()) and not (folder / _MADE_BY_SPHINX).exists():
         sys.exit(f"{folder} holds something else than a site: name another folder, or empty it")
@@ -35,7 +35,9 @@ def build(folder: Path, *, jobs: str = "auto") -> bool:
     except ImportError as error:
         sys.exit(f"{error.name} is missing: pip install -c .ci/constraints.txt -e '.[docs]'")
     shutil.rmtree(folder, ignore_errors=True)
-    arguments = ["-b", "html", "-W", "--keep-going", "-q", "-j", jobs]
+    # In one process: others would import all again and pickle their pages, on cores that the gate
+    # has other work for.
+    arguments = ["-b", "html", "-W", "--keep-going", "-q"]
     trees = folder.with_name(f"{folder.name}.trees")
     shutil.rmtree(trees, ignore_errors=True)
     return build_main([*arguments, "-d", str(trees), str(_ROOT / "docs"), str(folder)]) == 0

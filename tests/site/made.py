@@ -203,7 +203,7 @@ _FILES: Final[Mapping[str, Callable[[], _Lines]]] = {
 
 @cache
 def _schema() -> Mapping[str, Any]:
-    """As drawn in its file: each process that reads pages would build it anew, for 3 s."""
+    """As drawn in its file: to build it takes 3 s."""
     return dict(json.loads(SCHEMA.read_text(encoding="utf-8"))["$defs"])
 
 
