@@ -110,25 +110,23 @@ def open_adapter(
     place, release = lock_name(merged), acquire(merged, holder)
 
     def open_again() -> can.BusABC:
-        if known is not None:
-            link.channel = merged["channel"] = settings["channel"] = _find_again(known)
+        nonlocal place, release
+        try:
+            if known is not None:
+                link.channel = merged["channel"] = settings["channel"] = _find_again(known)
+        except BusError:
+            release()  # it may belong to the adapter that has the name now
+            place = ""
+            raise
+        # A symbolic link may lead to another serial port now.
+        if (new_place := lock_name(merged)) != place:
+            release()  # first: another program may wait for it, whose lock this one needs
+            place = ""
+            release = acquire(merged, holder)
+            place = new_place
         # The interface may have come back with other settings.
         bit_rate(default_bitrate_bps, config, merged, fallback)
-        nonlocal place, release
-        # A symbolic link may lead to another serial port now.
-        new_place, give_new_back = lock_name(merged), None
-        if new_place != place:
-            give_new_back = acquire(merged, holder)
-        try:
-            bus = open_bus(settings, sends=sends)
-        except BaseException:
-            if give_new_back is not None:
-                give_new_back()
-            raise
-        if give_new_back is not None:
-            release()
-            place, release = new_place, give_new_back
-        return bus
+        return open_bus(settings, sends=sends)
 
     try:
         link = CanLink(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import configparser
+import contextlib
 import errno
 import sys
 import time
@@ -436,6 +437,39 @@ def test_a_lost_adapter_is_found_again_by_its_serial_number_and_never_by_its_nam
             f"socketcan {channel}",
         )
     link.close()
+
+
+@pytest.mark.usefixtures("no_configuration")
+@each(
+    "steps",
+    [
+        ({"can2": B, "can3": A},),
+        ({"can2": B}, {"can2": B, "can3": A}),
+        ({"can2": B}, {"can2": B}, {"can2": B, "can3": A}),
+    ],
+)
+def test_two_programs_whose_adapters_exchange_their_names_do_not_lock_each_other_out(
+    monkeypatch: pytest.MonkeyPatch, steps: tuple[dict[str, dict[str, str]], ...]
+) -> None:
+    """The names are the locks, and each holds what the other waits for."""
+    seen = [{"can2": A, "can3": B}]
+    monkeypatch.setattr("can.Bus", lambda **_config: FakeBus())
+    monkeypatch.setattr(adapter, "plugged_in", lambda _interface: named(seen[-1]))
+    links = [
+        open_adapter(250_000, holder=f"socket {name}", interface="socketcan", channel=name)
+        for name in ("can2", "can3")
+    ]
+    for step in (*steps, steps[-1]):
+        seen.append(step)
+        for link in links:
+            with contextlib.suppress(BusError):
+                link.reopen()
+    for link, channel in zip(links, ("can3", "can2"), strict=True):
+        link.send(FRAME)
+        assert link.channel == channel
+        with pytest.raises(BusError, match="is in use by"):
+            open_adapter(250_000, holder="another", interface="socketcan", channel=channel)
+        link.close()
 
 
 def test_a_link_that_was_handed_a_bus_cannot_be_opened_again(bus: FakeBus) -> None:
