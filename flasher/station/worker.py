@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import gzip
 import hashlib
+import logging
 import os
 import shutil
 import signal
@@ -58,6 +59,8 @@ from flasher.station.unit_run import UnitRun
 from flasher.station.virtual_units import VirtualSocket
 from flasher.trace.recorder import Recorder
 
+logging.getLogger("can").addHandler(logging.NullHandler())
+"""Else python-can prints each failed opening into the station's table; `AdapterDown` reports it."""
 REOPEN_S: Final = 1.0
 """Interval between attempts to reopen a failed adapter."""
 RELOAD_S: Final = 5.0

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gzip
 import os
+import subprocess
+import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -294,6 +296,18 @@ def test_an_adapter_that_goes_while_no_unit_acknowledges_is_reported(tmp_path: P
     Worker(socket.setup, socket.recipe, socket.line, connection).work()
     kinds = [kind for kind in socket.kinds if kind != "PresenceChanged"]
     assert kinds == ["AdapterReady", "AdapterDown", "AdapterReady"]
+
+
+@pytest.mark.slow
+def test_python_can_prints_nothing_into_the_table_of_the_station() -> None:
+    program = (
+        "import flasher.station.worker, logging\n"
+        "logging.getLogger('can.interfaces.socketcan').error('Could not access SocketCAN device')"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert not done.stderr
 
 
 def test_an_adapter_that_cannot_be_opened_is_reported_once_and_tried_again(tmp_path: Path) -> None:
