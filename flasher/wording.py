@@ -197,10 +197,10 @@ _EXPLANATIONS: Final[dict[str, Explanation]] = {
     "update_not_taken": Explanation(
         "the update command names another target or too large an image, or it comes when the "
         "bootloader does not listen",
-        "Check that the device is a {node} and that the image fits it.",
+        "Check that the device is the {node} and that the image fits it.",
     ),
     "wrong_device": Explanation(
-        "the connected device is not a {node}, whose bootloader reports {boot_name}",
+        "the connected device is not the {node}, whose bootloader reports {boot_name}",
         "Check what is connected and which target was named.",
     ),
     "two_devices": Explanation(

@@ -289,13 +289,13 @@ _EXPLANATIONS: Final = {
     Ending.UNHEARING: ErrorDescription(
         NoAnswerError,
         "it is not the target device, it refuses this size, or it does not receive",
-        "Check that the device is a {node} and that the image fits it.",
+        "Check that the device is the {node} and that the image fits it.",
         code=ErrorCode.UNHEARING,
     ),
     Ending.WRONG_DEVICE: ErrorDescription(
         WrongDeviceError,
         "another device is connected, or the version of this one has another form: the bootloader "
-        "of a {node} reports {boot_name} Vx.x.x",
+        "of the {node} reports {boot_name} Vx.x.x",
         "Check -t/--target and what is connected; --allow-boot-name takes the device as it is.",
     ),
     Ending.BOOT_TOO_OLD: ErrorDescription(
