@@ -59,8 +59,6 @@ from flasher.station.unit_run import UnitRun
 from flasher.station.virtual_units import VirtualSocket
 from flasher.trace.recorder import Recorder
 
-logging.getLogger("can").addHandler(logging.NullHandler())
-"""Else python-can prints each failed opening into the station's table; `AdapterDown` reports it."""
 REOPEN_S: Final = 1.0
 """Interval between attempts to reopen a failed adapter."""
 RELOAD_S: Final = 5.0
@@ -474,6 +472,8 @@ def worker_main(channel: Channel, setup: WorkerSetup) -> None:
     for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK"):  # some lack one of the last two
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
+    # Else python-can prints each failed opening into the station's table; `AdapterDown` reports it.
+    logging.getLogger("can").addHandler(logging.NullHandler())
     pipe = StationPipe(channel, time.perf_counter)
     with suppress(StationGoneError):
         recipe = load_when_whole(pipe, setup)

@@ -101,7 +101,7 @@ WRONG: list[tuple[str, str, str]] = [
     (LEAST + "hardware_version = []", "unknown key 'hardware_version'", "hardware_versions?"),
     (LEAST + "Sha265 = 1", "unknown key 'Sha265'", "Did you mean sha256?"),
     (LEAST + "[wmc]\nx = 1", "unknown key 'wmc'", "Known are: format, target"),
-    ("format = 1", "has no target and no size_bytes and no sha256", "anew"),
+    ("format = 1", "has no target and no size_bytes and no sha256", "again"),
     (LEAST.replace('"bms"', '"hmi"'), "target cannot be 'hmi'", "one of wmc, bms, obc"),
     (LEAST.replace('"bms"', "2"), "target cannot be 2", "one of wmc"),
     ("format = 1\nsize_bytes = 0", "size_bytes cannot be 0", f"from 1 to {IMAGE_MAX_SIZE}"),

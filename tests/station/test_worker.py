@@ -301,7 +301,9 @@ def test_an_adapter_that_goes_while_no_unit_acknowledges_is_reported(tmp_path: P
 @pytest.mark.slow
 def test_python_can_prints_nothing_into_the_table_of_the_station() -> None:
     program = (
-        "import flasher.station.worker, logging\n"
+        "import logging, flasher.station.worker as worker\n"
+        "worker.load_when_whole = lambda pipe, setup: None\n"
+        "worker.worker_main(None, None)\n"
         "logging.getLogger('can.interfaces.socketcan').error('Could not access SocketCAN device')"
     )
     done = subprocess.run(
