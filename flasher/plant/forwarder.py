@@ -42,7 +42,6 @@ BATCH_BYTES: Final = 4 * 1024 * 1024
 """Traces of a batch; the first run is sent whatever its size."""
 _STATE_MAX_SIZE: Final = 64 * 1024
 _PART_AGE_S: Final = 3600.0
-_WITH_RUN: Final = (chain.CLAIMED, *chain.ENDINGS)
 _ROW: Final = ("number", "at", "event", "data", "previous_hash", "hash", "signature")
 
 ENTER: Final = text("SELECT * FROM plant_enter(:records, :station)")
@@ -243,7 +242,7 @@ class Forwarder:
                     compare(head, self._station, local, central, where=self._central.shown)
             following = chain.rows_after(self._station, head.number).limit(BATCH_ROWS)
             rows = local.execute(following).mappings().all()
-            runs = {row["run_id"] for row in rows if row["event"] in _WITH_RUN}
+            runs = {row["run_id"] for row in rows if row["event"] in chain.WITH_DIGESTS}
             contents = chain.contents_of(local, runs)
         for row in rows:
             content = contents.get(row["run_id"]) if row["event"] in chain.ENDINGS else None

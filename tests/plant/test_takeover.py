@@ -207,9 +207,10 @@ def test_a_run_that_ended_and_was_sent_without_its_end_is_interrupted(
 def test_a_unit_that_passes_at_both_pcs_is_named(
     plant: Plant, sender: Sender, key: bytes, spares: list[Sender]
 ) -> None:
-    sender.bench.make(serial="W2605001")
+    earlier = sender.bench.make(serial="W2605001")
     sender.send()
     taken(plant, key)
+    sender.bench.store.note(AuditEvent.LABELLED, {}, earlier)
     labelled = sender.bench.make(serial="W2605009", gets_label=True)
     sender.bench.store.note(AuditEvent.LABELLED, {}, labelled)
     sender.bench.make(serial="W2605008", gets_label=True)
@@ -217,8 +218,10 @@ def test_a_unit_that_passes_at_both_pcs_is_named(
     spare.bench.make(serial="W2605009")
     assert brought(spare, sender.bench.path).conflicts == ("W2605009",)
     sender.bench.make(serial="W2605010")  # the old PC still runs
+    sender.bench.store.note(AuditEvent.LABELLED, {}, labelled)
     assert len(brought(spare, sender.bench.path).runs) == 1
     assert [run.serial for run in spare.bench.store.read.unlabelled("line-2")] == ["W2605008"]
+    assert not spare.bench.store.examine().problems
     spare.send()
     assert not examined(plant).problems
 

@@ -72,7 +72,8 @@ def bring_in(
                 where=branch.location.shown,
                 remedy="Nothing is to be brought in.",
             )
-        contents = chain.contents_of(other, {row["run_id"] for row in rows if row["run_id"]})
+        made = {row["run_id"] for row in rows if row["event"] in chain.WITH_DIGESTS}
+        contents = chain.contents_of(other, made)
         last = chain.hash_at(other, store.station, fork) or chain.GENESIS
         _check(rows, contents, chain.ChainEnd(fork, last, key or ""))
     for content in contents.values():
@@ -184,8 +185,8 @@ def _check(
     """Check hashes, signatures and digests of a branch. Raises UnprovenError."""
     digests = chain.digests_in(contents)
     for row in rows:
-        has_run = row["event"] in (chain.CLAIMED, *chain.ENDINGS)
-        stated = chain.data_of(row["data"]).get("digests", {}) if has_run else {}
+        has_digests = row["event"] in chain.WITH_DIGESTS
+        stated = chain.data_of(row["data"]).get("digests", {}) if has_digests else {}
         found = digests.get(row["run_id"], {})
         if end.add(row) or any(found.get(part) != digest for part, digest in stated.items()):
             raise UnprovenError(

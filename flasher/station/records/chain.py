@@ -57,6 +57,8 @@ LABEL_DUE: Final = "label_due"
 """Key of a FINISHED row: the station prints a label for this PASS; LABELLED states that it has."""
 ENDINGS: Final = (FINISHED, INTERRUPTED)
 """Rows that hold the digests of a run that ended."""
+WITH_DIGESTS: Final = (CLAIMED, *ENDINGS)
+"""Rows that hold digests of their run; others name one that began before."""
 _KEYS: Final = (BEGUN, KEY_ROTATED, KEY_LOST)
 LOSSES: Final = (RESTORED, TAKEN_OVER)
 """Rows that may accept a range of rows as lost."""
