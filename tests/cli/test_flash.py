@@ -60,6 +60,9 @@ class _Time:
         self.now_s += 1e-7
         return self.now_s
 
+    def clock_gettime(self, _clock: int) -> float:
+        return self.now_s
+
     def sleep(self, seconds: float) -> None:
         self.now_s += seconds
 
