@@ -148,14 +148,17 @@ def open_adapter(
 
 def _find_again(known: DetectedAdapter) -> str:
     """Return the channel of an adapter, whose name may have changed when it was plugged in again.
-    Raises BusError if another adapter has its name now.
+    Ports that cannot be told apart keep their names. Raises BusError if another adapter has its
+    name now.
     """
     found = plugged_in(known.interface)
     same = [each for each in found if each.identity == known.identity]
     if len(same) > 1:  # makers may give all adapters one serial number
         same = [each for each in same if each.usb_path == known.usb_path]
-    if same or all(each.channel != known.channel for each in found):
-        return same[0].channel if same else known.channel
+    if len(same) == 1:
+        return same[0].channel
+    if all(each in same for each in found if each.channel == known.channel):
+        return known.channel
     raise BusError(
         f"{printable(known.channel)} is the name of another adapter now.",
         where=known.interface,

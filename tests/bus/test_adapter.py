@@ -401,6 +401,9 @@ TWIN = {"serial_number": "A", "usb_path": "1-2"}
         ({"can2": A, "can3": SECOND}, {"can2": B, "can3": A, "can4": SECOND}, "can3"),
         ({"can2": SECOND, "can1": A}, {"can2": A, "can3": SECOND}, "can3"),
         ({"can2": A, "can3": TWIN}, {"can2": TWIN, "can3": A}, "can3"),
+        ({"can1": A, "can2": A}, {"can1": A, "can2": A}, "can2"),  # macOS tells no ports apart
+        ({"can1": A, "can2": A}, {"can3": A, "can4": A}, "can2"),
+        ({"can1": A, "can2": A}, {"can2": B, "can3": A, "can4": A}, None),
         ({"can2": A}, {"can2": B}, None),
         ({"can2": A, "can3": TWIN}, {"can2": TWIN, "can4": {**A, "usb_path": "1-3"}}, None),
         ({"can2": NO_NUMBER}, {"can2": NO_NUMBER}, "can2"),
