@@ -851,7 +851,7 @@ class Station:
 
     def _print(self, run: RunRecord) -> None:
         """Print the label of a unit whose PASS is on disk."""
-        if self._labels is None:
+        if self._labels is None or _not_labelled(run) is not None:
             return
         if run.is_unchecked:
             self._label_failed(run, _no_label(run))

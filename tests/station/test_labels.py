@@ -416,6 +416,17 @@ def test_a_unit_that_failed_since_gets_none(bench: Bench) -> None:
     assert missing(LineBench(bench, labels=Printer(bench).labels)) == []
 
 
+def test_a_unit_that_is_golden_since_gets_none(bench: Bench) -> None:
+    killed_before_the_label(bench, SERIAL)
+    bench.use(f'{USUAL}\n[golden]\nserial_numbers = ["{SERIAL}"]\nevery_h = 8\n')
+    printer = Printer(bench)
+    line = LineBench(bench, labels=printer.labels)
+    line.make("A", SERIAL)
+    finished(line)
+    assert printer.came.empty()
+    assert missing(LineBench(bench, labels=Printer(bench).labels)) == []
+
+
 def test_a_pass_whose_duplicates_were_not_checked_gets_no_label_by_itself(bench: Bench) -> None:
     printer = Printer(bench)
     plant = Plant(bench, labels=printer.labels)

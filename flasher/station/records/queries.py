@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator, Mapping
 from typing import Any, Final, TypeVar, cast
 
 from pydantic import ValidationError
-from sqlalchemy import Connection, Select, literal, select
+from sqlalchemy import Connection, Select, and_, literal, select
 
 from flasher.documents import adapter
 from flasher.protocol.text import printable
@@ -24,6 +24,7 @@ from flasher.station.records.model import (
     RunDetails,
     RunFilter,
     RunId,
+    RunKind,
     RunRecord,
     RunState,
     StepName,
@@ -191,7 +192,7 @@ class Records:
 
     def unlabelled(self, station: str) -> list[RunRecord]:
         """Runs of a station, of its newest ones, whose label is not known to be printed. A unit
-        counts if its last run passed, and no later run of it has got the label.
+        counts if its last run is a PASS of a product, and no later run of it has got the label.
         """
         audit, of_unit = schema.audit.c, schema.run.alias().c
         own = select(schema.station.c.id).where(schema.station.c.name == station)
@@ -201,8 +202,8 @@ class Records:
             .order_by(audit.id.desc())
             .limit(LABELS_LOOKED_BACK)
         )
-        last_state = (
-            select(of_unit.state)
+        is_passed = (
+            select(and_(of_unit.state == RunState.PASS.value, of_unit.kind != RunKind.GOLDEN.value))
             .where(of_unit.unit_id == _RUN.unit_id)
             .order_by(of_unit.id.desc())
             .limit(1)
@@ -216,9 +217,7 @@ class Records:
                 audit.event == AuditEvent.LABELLED.value,
             )
         )
-        query = RUN_QUERY.where(
-            last_state.scalar_subquery() == RunState.PASS.value, ~labelled.exists()
-        ).order_by(_RUN.id)
+        query = RUN_QUERY.where(is_passed.scalar_subquery(), ~labelled.exists()).order_by(_RUN.id)
         with self._database.reading() as connection:
             rows = connection.execute(newest)
             due = sorted(row.run_id for row in rows if chain.LABEL_DUE in row.data)
