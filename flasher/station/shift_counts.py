@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import datetime, time, timedelta
 from typing import Final, NamedTuple
 
-from flasher.station.records.model import RunRecord, RunState, Units, local_moment
+from flasher.station.records.model import RunKind, RunRecord, RunState, Units, local_moment
 
 DEFAULT_SHIFTS: Final = (time(6), time(14), time(22))
 CAUSES_MAX: Final = 3
@@ -54,7 +54,9 @@ class ShiftCounts:
         self._runs: list[RunRecord] = []
 
     def add(self, run: RunRecord) -> None:
-        self._runs.append(run)
+        """Count a run, unless it is one of a golden unit."""
+        if run.kind is not RunKind.GOLDEN:
+            self._runs.append(run)
 
     def began(self, now: datetime) -> datetime:
         """Start of the current shift; `now` if there are no shifts."""

@@ -283,6 +283,14 @@ def test_a_shift_begins_at_its_local_time_though_the_offset_changes_in_it(
     assert (figures.hour.good, figures.shift.good) == (1, 1 if began == hour else 2)
 
 
+def test_a_golden_unit_counts_in_no_figure_of_a_shift(bench: Bench) -> None:
+    run = bench.store.read.run(bench.make(RunState.FAIL)).run
+    counts = ShiftCounts()
+    counts.add(replace(run, kind=RunKind.GOLDEN))
+    now = bench.clock.utc().astimezone()
+    assert counts.output(now) == ShiftCounts().output(now)
+
+
 # -- the station dies -----------------------------------------------------------------------------
 
 
