@@ -12,6 +12,7 @@ import platform
 import time
 from collections import deque
 from collections.abc import Callable
+from itertools import compress
 from typing import Any, Final, NoReturn
 
 from flasher.bus.back_ends import (
@@ -113,7 +114,10 @@ def open_adapter(
         nonlocal place, release
         try:
             if known is not None:
-                link.channel = merged["channel"] = settings["channel"] = _find_again(known)
+                name = _find_again(known, has_twin=has_twin)
+                given, *rate_of_port = channel.partition("@")  # slcan: DEVICE@BAUDRATE
+                name = "".join((given if name == known.channel else name, *rate_of_port))
+                link.channel = merged["channel"] = settings["channel"] = name
         except BusError:
             release()  # it may belong to the adapter that has the name now
             place = ""
@@ -141,19 +145,21 @@ def open_adapter(
         release()
         raise
     link.bit_rate = rate
-    listed = (each for each in plugged_in(interface) if each.channel == channel)
-    known = next((each for each in listed if any(each.identity)), None)
+    listed = [each for each in plugged_in(interface) if any(each.identity)]
+    is_known = (lock_name({**merged, "channel": each.channel}) == place for each in listed)
+    known = next(compress(listed, is_known), None)
+    has_twin = known is not None and [each.identity for each in listed].count(known.identity) > 1
     return link
 
 
-def _find_again(known: DetectedAdapter) -> str:
+def _find_again(known: DetectedAdapter, *, has_twin: bool) -> str:
     """Return the channel of an adapter, whose name may have changed when it was plugged in again.
     Ports that cannot be told apart keep their names. Raises BusError if another adapter has its
     name now.
     """
     found = plugged_in(known.interface)
     same = [each for each in found if each.identity == known.identity]
-    if len(same) > 1:  # makers may give all adapters one serial number
+    if has_twin or len(same) > 1:  # makers may give all adapters one serial number
         same = [each for each in same if each.usb_path == known.usb_path]
     if len(same) == 1:
         return same[0].channel
@@ -163,7 +169,7 @@ def _find_again(known: DetectedAdapter) -> str:
         f"{printable(known.channel)} is the name of another adapter now.",
         where=known.interface,
         cause=f"the adapter {printable(known.identity[0])} is not plugged in any more, or it has "
-        "no serial number and is in another port",
+        "no serial number of its own and is in another port",
         remedy="Plug it in where it was.",
         code=ErrorCode.ADAPTER_LOST,
     )

@@ -331,11 +331,11 @@ class RunReport:
 
     @cached_property
     def ok(self) -> bool:
-        """True when nothing failed, the run was not stopped early, and the good image is back on
-        the device.
+        """True when nothing failed, the good image could be flashed before the first case and is
+        back on the device, and the run was not stopped early.
         """
         # A strict run also fails on a pass in part and on a resolved deviation.
-        if self.stopped or self.final_image != FINAL_IMAGE_OK:
+        if self.stopped or self.not_upgradable or self.final_image != FINAL_IMAGE_OK:
             return False
         if self.strict and (self.resolved_deviations or self.count(CaseVerdict.PASS_IN_PART)):
             return False

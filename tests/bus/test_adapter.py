@@ -406,6 +406,10 @@ TWIN = {"serial_number": "A", "usb_path": "1-2"}
         ({"can1": A, "can2": A}, {"can2": B, "can3": A, "can4": A}, None),
         ({"can2": A}, {"can2": B}, None),
         ({"can2": A, "can3": TWIN}, {"can2": TWIN, "can4": {**A, "usb_path": "1-3"}}, None),
+        ({"can2": A, "can3": TWIN}, {"can3": TWIN}, "can2"),
+        ({"can2": A, "can3": TWIN}, {"can2": TWIN}, None),
+        ({"can1": A, "can2": A}, {"can1": A, "can2": A}, "can2"),
+        ({"can1": A, "can2": A}, {"can3": A, "can4": A}, "can2"),
         ({"can2": NO_NUMBER}, {"can2": NO_NUMBER}, "can2"),
         ({"can2": NO_NUMBER}, {"can2": {"usb_path": "1-2"}}, None),
         ({"can2": {}, "can1": {}}, {"can2": {}, "can1": {}}, "can2"),
@@ -439,6 +443,37 @@ def test_a_lost_adapter_is_found_again_by_its_serial_number_and_never_by_its_nam
             channel,
             f"socketcan {channel}",
         )
+    link.close()
+
+
+@pytest.mark.usefixtures("no_configuration")
+@each(
+    "given, name, again",
+    [
+        ("/dev/ttyACM0@115200", "/dev/ttyACM0", "/dev/ttyACM1@115200"),
+        ("com3", "COM3", "/dev/ttyACM1"),
+        (r"\\.\COM3", "COM3", "/dev/ttyACM1"),
+    ],
+)
+def test_a_lost_adapter_is_found_again_whichever_way_its_port_was_named(
+    monkeypatch: pytest.MonkeyPatch, given: str, name: str, again: str
+) -> None:
+    seen: list[str] = []
+
+    def open_bus(**config: Any) -> FakeBus:
+        seen.append(config["channel"])
+        return FakeBus()
+
+    def ports(**names: dict[str, str]) -> None:
+        listed = [DetectedAdapter("slcan", each, details) for each, details in names.items()]
+        monkeypatch.setattr(adapter, "plugged_in", lambda _interface: listed)
+
+    monkeypatch.setattr("can.Bus", open_bus)
+    ports(**{name: A})
+    link = open_adapter(250_000, interface="slcan", channel=given)
+    ports(**{name: B, "/dev/ttyACM1": A})
+    link.reopen()
+    assert seen == [given, again]
     link.close()
 
 

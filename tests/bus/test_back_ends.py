@@ -749,22 +749,51 @@ def test_a_socketcand_that_sends_nonsense_or_is_gone_is_lost() -> None:
         assert caught.value.code is LOST
 
 
-def test_a_socketcand_that_does_not_greet_ends_in_bounded_time(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("flasher.bus.opening._ANSWER_LIMIT_S", 0.05)
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        config = {"interface": "socketcand", "channel": "can0", "host": "127.0.0.1"}
-        with pytest.raises(BusError, match="cannot be opened: timed out") as caught:
-            open_bus({**config, "port": server.getsockname()[1]})
+def fails_to_open_socketcand(port: int, why: str) -> None:
+    config = {"interface": "socketcand", "channel": "can0", "host": "127.0.0.1", "port": port}
+    with pytest.raises(BusError, match=f"cannot be opened: .*{why}") as caught:
+        open_bus(config)
     assert "no socketcand server answers" in caught.value.cause
     assert "Start socketcand there" in caught.value.remedy
-    assert socket.getdefaulttimeout() is None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ResourceWarning)  # python-can leaves its socket open
         caught.value.__cause__ = None
         del caught
         gc.collect()
+
+
+def test_a_socketcand_that_does_not_greet_ends_in_bounded_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("flasher.bus.opening._ANSWER_LIMIT_S", 0.05)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        fails_to_open_socketcand(server.getsockname()[1], "timed out")
+    assert socket.getdefaulttimeout() is None
+
+
+def test_a_socketcand_server_that_is_down_is_tried_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    tries: list[object] = []
+
+    def refuse(_socket: socket.socket, address: object) -> None:
+        tries.append(address)
+        if len(tries) > 1:
+            pytest.fail("it is tried again without a pause")
+        raise ConnectionRefusedError(errno.ECONNREFUSED, "Connection refused")
+
+    monkeypatch.setattr(socket.socket, "connect", refuse)
+    fails_to_open_socketcand(29536, "Connection refused")
+    assert tries == [("127.0.0.1", 29536)]
+
+
+@each("given, tuned", [({}, True), ({"tcp_tune": False}, False)])
+def test_frames_to_a_socketcand_server_do_not_wait_for_the_confirmation_of_the_last_one(
+    monkeypatch: pytest.MonkeyPatch, given: dict[str, bool], tuned: bool
+) -> None:
+    seen: list[dict[str, Any]] = []
+    monkeypatch.setattr("can.Bus", lambda **config: seen.append(config))
+    monkeypatch.setattr("platform.system", lambda: "Linux")
+    open_bus({"interface": "socketcand", "channel": "can0", **given})
+    assert seen[0]["tcp_tune"] is tuned
 
 
 def test_two_threads_that_open_a_socketcand_leave_sockets_without_a_limit() -> None:

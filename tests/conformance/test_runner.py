@@ -354,6 +354,28 @@ def test_a_case_about_a_running_application_is_inconclusive_where_none_could_be_
     assert not report.ok
 
 
+class LateDevice(MockDevice):
+    """Receives no packet in the first minutes, as by a loose contact."""
+
+    def receive(self, frame: Frame, now: float) -> None:
+        if now > 200.0 or frame.data[4:6] != b"\xa3\x85":
+            super().receive(frame, now)
+
+
+@pytest.mark.slow
+def test_a_run_whose_first_upgrade_failed_is_not_ok_although_its_last_one_did_not() -> None:
+    empty = device_maker(partial(LateDevice, has_application=False))
+    report = run_case(
+        fails,
+        device=MockSubject("bms", make_device=empty),
+        requires=frozenset({Requirement.APPLICATION}),
+    )
+    assert one(report, "FR-00").verdict is CaseVerdict.INCONCLUSIVE
+    assert (report.final_image, report.stopped) == ("verified", "")
+    assert report.not_upgradable
+    assert not report.ok
+
+
 def test_an_application_that_still_runs_is_judged_although_the_good_image_is_refused() -> None:
     device = MockSubject("bms", good_image=bytes(300 * 1024))
     report = run(device, PROFILE, selection=Selection(cases=("RS-01", "RS-04")))
