@@ -479,8 +479,8 @@ class UpgradeStage:
         timings = self._timings
         match tag, self.state:
             case _, UpgradeState.WATCHING:
-                self._at.watched_until = self._tx.left_at + self._boot_watch_s
-                return self._boot_watch_s
+                self._at.watched_until = self._watch_end(self._tx.left_at)
+                return self._at.watched_until - self._tx.left_at
             case Command.PACKET, UpgradeState.TRANSFERRING:
                 return timings.ack_timeout_s
             case Command.PACKET, UpgradeState.SETTLING:
@@ -614,22 +614,24 @@ class UpgradeStage:
         now, timings, at = self._run.now, self._timings, self._at
         self._enter(UpgradeState.WATCHING)
         self._tx.drop_unstarted()
-        wait_s = (
-            timings.boot_version_timeout_s
+        at.watched_since = now
+        at.watched_until = (
+            now + timings.boot_version_timeout_s
             if self._duplicates.application_beside
-            else self._boot_watch_s
+            else self._watch_end(now)
         )
-        at.watched_since, at.watched_until = now, now + wait_s
         if self._tx.idle:
             self._timer_at = min(at.watched_until, now + timings.burst_s)
 
-    @property
-    def _boot_watch_s(self) -> float:
-        """Time to watch for a second device: in a transfer, long enough for the answer of a first
-        one that is slow, but not beyond the burst, of which one boot version may be lost.
+    def _watch_end(self, now: float) -> float:
+        """Time until which to watch for a second device: in a transfer, until the answer of a first
+        one that is slow is due, but not beyond the burst, of which one boot version may be lost.
         """
+        due_at = self._tx.left_at + 2 * self._slowest_answer_s
         in_burst_s = 2.5 * self._timings.boot_version_spacing_s
-        return max(self._timings.boot_watch_s, min(2 * self._slowest_answer_s, in_burst_s))
+        return max(
+            now + self._timings.boot_watch_s, min(due_at, self._at.watched_since + in_burst_s)
+        )
 
     def _watch_on(self, content: BootVersion | GeneralFeedbackMessage) -> None:
         now, timings, at = self._run.now, self._timings, self._at

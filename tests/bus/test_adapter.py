@@ -408,8 +408,6 @@ TWIN = {"serial_number": "A", "usb_path": "1-2"}
         ({"can2": A, "can3": TWIN}, {"can2": TWIN, "can4": {**A, "usb_path": "1-3"}}, None),
         ({"can2": A, "can3": TWIN}, {"can3": TWIN}, "can2"),
         ({"can2": A, "can3": TWIN}, {"can2": TWIN}, None),
-        ({"can1": A, "can2": A}, {"can1": A, "can2": A}, "can2"),
-        ({"can1": A, "can2": A}, {"can3": A, "can4": A}, "can2"),
         ({"can2": NO_NUMBER}, {"can2": NO_NUMBER}, "can2"),
         ({"can2": NO_NUMBER}, {"can2": {"usb_path": "1-2"}}, None),
         ({"can2": {}, "can1": {}}, {"can2": {}, "can1": {}}, "can2"),

@@ -264,6 +264,19 @@ def test_a_slow_device_that_has_restarted_has_update_command_before_its_burst_en
     bench.expect(UpdateCommand, within_s=0.13)
 
 
+@each("lost", [1, 2, 3])
+def test_a_slow_device_whose_first_boot_versions_were_lost_has_update_command_in_its_burst(
+    lost: int,
+) -> None:
+    bench = in_transfer(5)
+    bench.wait(0.06)
+    bench.say(Ack(5))
+    bench.expect(Packet)
+    bench.wait(lost * 0.05)
+    bench.say(BootVersion("WMC", "V1.2.3"))
+    bench.expect(UpdateCommand, within_s=0.195 - lost * 0.05)
+
+
 def test_a_device_that_has_restarted_has_update_command_after_a_moment() -> None:
     bench = in_transfer(5)
     bench.say(Ack(5))
