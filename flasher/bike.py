@@ -26,7 +26,7 @@ from flasher.errors import (
 from flasher.history import Flash, FlashHistory, left_open
 from flasher.host.identity import CheckResult, DeviceAnswers, judge_device, new_version
 from flasher.host.options import serial_number
-from flasher.jobs import Job, OpenedImage, open_image, refusal
+from flasher.jobs import Job, OpenedImage, image_of_release, open_image, refusal
 from flasher.procedures import check_no_other_tool, two_devices_error
 from flasher.protocol.contents import RunningInformation, VersionInformation
 from flasher.protocol.spec import BMS, OBC, WMC, Dialect, Target
@@ -67,9 +67,10 @@ def open_bike_set(
     if is_container(path):
         from flasher.release.verify import open_package  # noqa: PLC0415  for releases alone
 
-        for target in open_package(path).targets:
-            opened = open_image(
-                path,
+        package = open_package(path)  # once: another release may take its name meanwhile
+        for target in package.targets:
+            opened = image_of_release(
+                package,
                 target,
                 require_signed=require_signed,
                 allow_outside_vector=allow_outside_vector,

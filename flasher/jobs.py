@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from flasher.errors import FlasherError, UsageError, printable
 from flasher.host import waivers
@@ -23,6 +23,9 @@ from flasher.procedures import plan_for
 from flasher.protocol.spec import Target
 from flasher.settings.manifest import find_release
 from flasher.settings.profile import Profile
+
+if TYPE_CHECKING:
+    from flasher.release.verify import Package
 
 
 @dataclass(frozen=True)
@@ -87,13 +90,31 @@ def _signed(
         return None
     from flasher.release import verify  # noqa: PLC0415  for releases alone
 
-    package = verify.open_package(found)
-    provenance = verify.provenance_of(package, target, _today(), is_required=require_signed)
-    image, release = verify.image_of(
-        package,
+    return image_of_release(
+        verify.open_package(found),
         target,
         beside=path if os.fspath(found) != os.fspath(path) else None,
+        require_signed=require_signed,
         allow_outside_vector=allow_outside_vector,
+    )
+
+
+def image_of_release(
+    package: Package,
+    target: Target,
+    *,
+    beside: str | os.PathLike[str] | None = None,
+    require_signed: bool = False,
+    allow_outside_vector: bool = False,
+) -> OpenedImage:
+    """Load the image for a target from an opened release, as `open_image` does. `beside` is the
+    image of a detached release.
+    """
+    from flasher.release import verify  # noqa: PLC0415  for releases alone
+
+    provenance = verify.provenance_of(package, target, _today(), is_required=require_signed)
+    image, release = verify.image_of(
+        package, target, beside=beside, allow_outside_vector=allow_outside_vector
     )
     return OpenedImage(with_release(image, release), release, provenance)
 

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from flasher import api
-from flasher.bike import in_safe_order
+from flasher.bike import in_safe_order, open_bike_set
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
 from flasher.errors import ExitCode
@@ -26,6 +26,7 @@ from flasher.protocol.fields import WireText
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, OBC, TARGETS, WELLING, WMC, Target
 from flasher.protocol.text import encode_text
+from flasher.release import verify
 from tests.cli.conftest import Flasher, Run
 from tests.end_to_end.stage import NEW, NEWER, OLD, image_of, packet_number
 from tests.loops import each
@@ -162,18 +163,46 @@ def test_a_device_that_reports_the_version_of_the_set_is_left_alone_unless_force
     assert bike.erased == [OBC, WMC, BMS]
 
 
+def build_release(flasher: Flasher, path: Path) -> None:
+    """Build a release of the images in its folder."""
+    images = [
+        word
+        for target in IMAGES
+        for word in ("--image", f"{target.name}={path.with_name(target.name)}.bin")
+    ]
+    built = flasher("release", "build", path, *images, "--product", "X", "--counter", "1")
+    assert built.code == ExitCode.OK, built.err
+
+
+@pytest.mark.slow
+def test_no_images_of_two_releases_are_a_set(
+    flasher: Flasher, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A newer release takes the name of the first one, on a share, while that is opened."""
+    first, second = folder / "bike.wfw", folder / "second.wfw"
+    build_release(flasher, first)
+    for target in IMAGES:
+        (folder / f"{target.name}.bin").write_bytes(image_of(4, NEWER).data)
+    build_release(flasher, second)
+
+    def replace_it(*args: Any, **options: Any) -> object:
+        if second.exists():
+            second.replace(first)
+        return provenance_of(*args, **options)
+
+    provenance_of = verify.provenance_of
+    monkeypatch.setattr(verify, "provenance_of", replace_it)
+    opened = open_bike_set(first)
+    assert not second.exists()
+    assert {each.opened.image.version for each in opened} == {NEW}
+
+
 @pytest.mark.slow
 def test_a_release_with_several_images_is_a_set(
     bike: BikeOnTheBus, flasher: Flasher, folder: Path
 ) -> None:
     release = folder / "bike.wfw"
-    images = [
-        word
-        for target in IMAGES
-        for word in ("--image", f"{target.name}={folder / target.name}.bin")
-    ]
-    built = flasher("release", "build", release, *images, "--product", "X", "--counter", "1")
-    assert built.code == ExitCode.OK, built.err
+    build_release(flasher, release)
     run = flasher("flash", "--bike", release, *WORDS, "--without", "bms")
     assert run.code == ExitCode.WRONG_DEVICE, "the release states the version of the battery"
     run = flasher("flash", "--bike", release, *WORDS)
