@@ -139,13 +139,16 @@ def causes(error: BaseException) -> Iterator[BaseException]:
 
 
 def error_text(error: BaseException) -> str:
-    """Messages of an exception and its causes without full stop, or its type if there are none."""
+    """Messages of an exception and its causes without full stop, or its type if there are none. A
+    server may have written into them: control characters are escaped.
+    """
     texts: list[str] = []
     for each in causes(error):
-        words = str(each).partition(_TRACEBACK)[0].strip().rstrip(".!")
+        words = " ".join(str(each).partition(_TRACEBACK)[0].split()).rstrip(".!")
         if words and not any(words in earlier for earlier in texts):
             texts.append(words)
-    return ": ".join(texts) or type(error).__name__
+    whole = ": ".join(texts) or type(error).__name__
+    return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in whole)
 
 
 def _codes(chain: list[BaseException]) -> set[int]:

@@ -771,6 +771,19 @@ def test_a_socketcand_that_does_not_greet_ends_in_bounded_time(
     assert socket.getdefaulttimeout() is None
 
 
+def test_what_a_server_answers_in_place_of_a_greeting_reaches_no_terminal_as_it_is() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer() -> None:
+            with server.accept()[0] as connection:
+                connection.sendall(b"\x1b[2JHTTP/1.1 400\r\n\x07")
+
+        answering = threading.Thread(target=answer)
+        answering.start()
+        fails_to_open_socketcand(server.getsockname()[1], r"'\\x1b\[2JHTTP/1.1 400 \\x07'")
+        answering.join()
+
+
 def test_a_socketcand_server_that_is_down_is_tried_once(monkeypatch: pytest.MonkeyPatch) -> None:
     tries: list[object] = []
 
