@@ -8,7 +8,14 @@ from dataclasses import dataclass
 from datetime import datetime, time, timedelta
 from typing import Final, NamedTuple
 
-from flasher.station.records.model import RunKind, RunRecord, RunState, Units, local_moment
+from flasher.station.records.model import (
+    RunKind,
+    RunRecord,
+    RunState,
+    Units,
+    UnitTally,
+    local_moment,
+)
 
 DEFAULT_SHIFTS: Final = (time(6), time(14), time(22))
 CAUSES_MAX: Final = 3
@@ -84,14 +91,11 @@ def _count(runs: Iterable[RunRecord]) -> Count:
 
 
 def _units(runs: Iterable[RunRecord]) -> Units:
-    """Units by the first and the last of these runs, which are in order."""
-    first: dict[str, bool] = {}
-    last: dict[str, bool] = {}
+    """Units of these runs, which are in order."""
+    tally = UnitTally()
     for run in runs:
-        is_passed = run.state is RunState.PASS
-        first.setdefault(run.serial, is_passed)
-        last[run.serial] = is_passed
-    return Units(len(last), sum(last.values()), sum(first.values()))
+        tally.add(run.serial, is_passed=run.state is RunState.PASS)
+    return tally.units
 
 
 def _at(run: RunRecord) -> datetime:

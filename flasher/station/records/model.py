@@ -593,6 +593,23 @@ class Units:
         return self.first_passed / self.units if self.units else None
 
 
+class UnitTally:
+    """Counts the units of runs that are added one by one, those of a unit in order."""
+
+    def __init__(self) -> None:
+        self.units = Units()
+        self._is_passed: dict[object, bool] = {}
+        """The last run of each unit."""
+
+    def add(self, unit: object, *, is_passed: bool) -> None:
+        before = self._is_passed.get(unit)
+        if before is None:
+            self.units.units += 1
+            self.units.first_passed += is_passed
+        self.units.passed += is_passed - bool(before)
+        self._is_passed[unit] = is_passed
+
+
 @json_keys(
     "runs units passed first_passed yield_share first_pass_share by_state failures"
     " duration_median_s duration_longest_s virtual_runs"

@@ -11,7 +11,7 @@ from sqlalchemy import Select, func, select
 from flasher.station.records import schema
 from flasher.station.records.database import Database
 from flasher.station.records.filters import JUDGED, WITHOUT_CAUSE, counting
-from flasher.station.records.model import Figures, RunFilter, RunState
+from flasher.station.records.model import Figures, RunFilter, RunState, UnitTally
 from flasher.station.records.rollup import ended_after
 
 
@@ -23,8 +23,7 @@ class Tally:
         self._failures: Counter[str] = Counter()
         self.virtual_runs = 0
         self._durations_s: list[float] = []
-        self._first: dict[int, bool] = {}
-        self._last: dict[int, bool] = {}
+        self._units = UnitTally()
 
     def add(self, row: Any) -> None:
         """Add a row of `tallied`."""
@@ -37,8 +36,7 @@ class Tally:
         if state not in WITHOUT_CAUSE:
             self._failures[code] += 1
         if state in JUDGED:
-            self._first.setdefault(unit_id, is_passed)
-            self._last[unit_id] = is_passed
+            self._units.add(unit_id, is_passed=is_passed)
 
     def figures(self, active: Tally | None = None) -> Figures:
         """Figures of these runs; `active`: others that have not ended."""
@@ -47,9 +45,7 @@ class Tally:
         by_state = self.by_state + others.by_state
         failures = sorted(self._failures.items(), key=lambda item: (-item[1], item[0]))
         return Figures(
-            len(self._last),
-            sum(self._last.values()),
-            sum(self._first.values()),
+            **vars(self._units.units),
             runs=by_state.total(),
             by_state=dict(by_state),
             virtual_runs=self.virtual_runs + others.virtual_runs,
