@@ -955,7 +955,7 @@ def _no_label(run: RunRecord) -> Refused:
         return Refused(
             Refusal.NOT_CHECKED.value,
             text("It was not checked whether it has passed at another station."),
-            text("Scan it again when the plant answers; or scan REPRINT {serial}.", serial=serial),
+            text("If it has passed at no other station, scan REPRINT {serial}.", serial=serial),
         )
     return Refused(
         "NOT_PRINTED",

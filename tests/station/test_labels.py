@@ -439,6 +439,7 @@ def test_a_pass_whose_duplicates_were_not_checked_gets_no_label_by_itself(bench:
     assert line.last(RunEnded).run.is_unchecked
     failed = line.last(LabelFailed)
     assert failed.reason == "It was not checked whether it has passed at another station."
+    assert failed.remedy == f"If it has passed at no other station, scan REPRINT {SERIAL}."
     line.station.close()
     assert printer.came.empty()
     plant = Plant(bench, labels=Printer(bench).labels)
