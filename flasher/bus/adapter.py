@@ -11,7 +11,7 @@ import contextlib
 import platform
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import compress
 from typing import Any, Final, NoReturn
 
@@ -107,7 +107,7 @@ def open_adapter(
     settings = merged if "timing" in merged else {**merged, "bitrate": rate.bps}
 
     interface = str(merged["interface"])
-    channel = str(merged.get("channel") or "")
+    channel = "" if merged.get("channel") is None else str(merged["channel"])
     place, release = lock_name(merged), acquire(merged, holder)
 
     def open_again() -> can.BusABC:
@@ -140,6 +140,7 @@ def open_adapter(
             open_again,
             lambda: release(),  # noqa: PLW0108  replaced when reopened
             gives_own=interface != "socketcan" or bool(merged.get("receive_own_messages")),
+            chosen_by=DetectedAdapter(interface, channel, merged).bus_kwargs,
         )
     except BaseException:
         release()
@@ -187,8 +188,10 @@ class CanLink:
         release: Callable[[], None] = lambda: None,
         *,
         gives_own: bool = True,
+        chosen_by: Mapping[str, Any] | None = None,
     ) -> None:
         self._release = release
+        self._chosen_by = [f"{key}={value}" for key, value in (chosen_by or {}).items()]
         self._interface = interface
         self.channel = channel
         """Channel of the adapter; may be empty."""
@@ -252,8 +255,8 @@ class CanLink:
         port.read = counting
 
     def __str__(self) -> str:
-        """Name of the adapter."""
-        return f"{self._interface} {self.channel}".strip()
+        """Name of the adapter, with what distinguishes it from others with its channel."""
+        return " ".join(filter(None, (self._interface, self.channel, *self._chosen_by)))
 
     def send(self, frame: Frame) -> None:
         """Pass a frame to the adapter; wait up to `SEND_LIMIT_S` for room in a full transmit queue.

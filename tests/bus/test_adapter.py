@@ -380,6 +380,31 @@ def test_a_lost_adapter_is_opened_again_with_the_same_configuration(
     link.close()
 
 
+@pytest.mark.usefixtures("no_configuration")
+@each(
+    "config, name",
+    [
+        (
+            {"interface": "socketcand", "channel": "can0", "host": "pi1", "port": 29536},
+            "socketcand can0 host=pi1 port=29536",
+        ),
+        (
+            {"interface": "ixxat", "channel": "0", "unique_hardware_id": "HW1"},
+            "ixxat 0 unique_hardware_id=HW1",
+        ),
+        ({"interface": "pcan", "channel": "PCAN_USBBUS1"}, "pcan PCAN_USBBUS1"),
+    ],
+)
+def test_the_name_of_an_adapter_is_not_that_of_another_one_with_its_channel(
+    monkeypatch: pytest.MonkeyPatch, config: dict[str, Any], name: str
+) -> None:
+    """The history finds an interrupted upgrade by it."""
+    monkeypatch.setattr("can.Bus", lambda **_config: FakeBus())
+    link = open_adapter(250_000, **config)
+    assert str(link) == name
+    link.close()
+
+
 def named(names: dict[str, dict[str, str]]) -> list[DetectedAdapter]:
     return [DetectedAdapter("socketcan", name, details) for name, details in names.items()]
 
