@@ -81,7 +81,6 @@ from flasher.station.records.model import (
     RunResult,
     RunState,
     StationClock,
-    UnitLife,
     WriteId,
 )
 from flasher.station.records.store import Store, SystemClock
@@ -736,11 +735,6 @@ class Station:
         self._runs[socket] = ActiveRun(claim, self._now, order.admission, gets_label)
         return RunStarted(socket, claim.serial, claim.run_id, claim.kind, order.is_virtual)
 
-    def _life(self, serial: str) -> UnitLife | None:
-        """Earlier runs of a unit of a part that is made here. Raises RecordError."""
-        parts = {each.recipe.part for each in self.recipes.values()}
-        return next((e for e in self.store.read.units(serial) if e.part in parts), None)
-
     def _begin(self, started: RunStarted) -> None:
         """Send the claimed run to the process of its socket."""
         self.emit(started)
@@ -865,8 +859,10 @@ class Station:
             reason = text("This station has no printer.")
             return Refused("NO_PRINTER", reason, text("Set it up in the station file."))
         try:
-            life = self._life(serial)
-            last = None if life is None else life.last
+            lasts = [last for each in self.store.read.units(serial) if (last := each.last)]
+            # Of several units with this serial number, that of a part that is made here.
+            parts = {each.recipe.part for each in self.recipes.values()}
+            last = max(lasts, key=lambda e: (e.run.part in parts, e.run.run_id), default=None)
             refused = _NOT_PASSED if last is None else _not_labelled(last.run)
             if refused is not None or last is None:
                 return refused

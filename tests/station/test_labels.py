@@ -390,6 +390,18 @@ def test_the_next_start_names_each_label_that_a_kill_has_lost(bench: Bench) -> N
     assert missing(LineBench(bench)) == []
 
 
+def test_a_label_of_the_product_before_is_printed_too(bench: Bench) -> None:
+    killed_before_the_label(bench, SERIAL)
+    bench.use(USUAL.replace("BAT-36", "BAT-48"))
+    printer = Printer(bench)
+    line = LineBench(bench, labels=printer.labels)
+    assert missing(line) == [SERIAL]
+    line.scan(f"REPRINT {SERIAL}")
+    finished(line)
+    assert missing(line) == []
+    assert printer.came.get(timeout=LIMIT_S).startswith(b"^XA")
+
+
 def test_a_unit_that_is_verified_gets_the_label_that_it_lacks(bench: Bench) -> None:
     bench.use(USUAL.replace("revision", 'duplicate = "verify-only"\nrevision', 1))
     killed_before_the_label(bench, SERIAL)
