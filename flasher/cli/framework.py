@@ -98,7 +98,7 @@ class _Parameter(rich_click.RichParameter):
     def consume_value(self, ctx: click.Context, opts: Mapping[str, Any]) -> tuple[Any, Any]:
         value, source = super().consume_value(ctx, opts)
         if source is ParameterSource.COMMANDLINE:
-            ctx.meta.setdefault(_TYPED, {}).setdefault(ctx.command_path, {})[self.name] = value
+            retype(ctx, str(self.name), value)
         return value, source
 
 
@@ -210,6 +210,11 @@ def _typed(ctx: click.Context) -> dict[str, Any]:
     """Return the values as typed, by the names of the parameters."""
     found: dict[str, Any] = ctx.meta.get(_TYPED, {}).get(ctx.command_path, {})
     return found
+
+
+def retype(ctx: click.Context, name: str, value: str) -> None:
+    """Have command lines that are built from now on give a parameter this value."""
+    ctx.meta.setdefault(_TYPED, {}).setdefault(ctx.command_path, {})[name] = value
 
 
 def _typed_options(ctx: click.Context, without: Callable[[str], bool]) -> Iterator[str]:

@@ -13,6 +13,7 @@ import click
 import pytest
 
 from flasher import events
+from flasher.bus.simulated import SimulatedLink
 from flasher.cli.upgrade import acceptance
 from flasher.cli.upgrade.choices import repair_command
 from flasher.errors import ExitCode
@@ -88,6 +89,33 @@ def test_the_command_that_is_named_repairs_as_printed(
     repaired = flasher(*repair_named_in(failed.err))
     assert repaired.code == ExitCode.OK, repaired.err
     assert stage.has == IMAGE.data
+
+
+def test_the_command_that_repairs_names_the_adapter_as_it_came_back(
+    flasher: Flasher, stage: Stage, tmp_path: Path
+) -> None:
+    """Another adapter may have its old name, and another unit."""
+    stage.wrap = lambda link: Renamed(link._bus, link._queue_frames)
+    stage.at_packet[2] = lambda: stage.bus.unplug(1.0)
+    stage.at_packet[3] = stage.cut_power
+    image = tmp_path / "new.bin"
+    image.write_bytes(IMAGE.data)
+    failed = flasher("flash", image, "-t", "bms", "-i", "virtual", "-c", "can2")
+    assert "it is virtual can3 now" in failed.err
+    repair = repair_named_in(failed.err)
+    assert repair[repair.index("-c") + 1] == "can3"
+    assert "can2" not in repair
+
+
+class Renamed(SimulatedLink):
+    channel = ""
+
+    def reopen(self) -> None:
+        super().reopen()
+        self.channel = "can3"
+
+    def __str__(self) -> str:
+        return f"virtual {self.channel}"
 
 
 @pytest.fixture

@@ -115,11 +115,15 @@ class BikeUpgrade:
         self._left_out: list[SetImage] = []
         self._battery = ""
         """Serial number of the battery before the first upgrade; empty if not known."""
+
+    @property
+    def _again(self) -> str:
+        """Command that goes on with the set."""
         ctx = click.get_current_context()
         # A deadline that has passed once would pass again.
         without = TRACE_OPTIONS | {"--timeout"}
         words = rebuild_command_line(ctx, str(ctx.info_name), without=without.__contains__)
-        self._again = shlex.join(["flasher", *words])
+        return shlex.join(["flasher", *words])
 
     def run(self, target: Target | None) -> int:
         """Check the set, look at the bike, upgrade its devices; return the exit code."""

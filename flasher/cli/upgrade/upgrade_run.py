@@ -13,7 +13,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import click
+
 from flasher.api import CallOptions, Connection
+from flasher.cli.framework import retype
 from flasher.cli.options import Bus
 from flasher.cli.output import Output
 from flasher.cli.recording import Recording, RecordingOptions, recording
@@ -27,6 +30,7 @@ from flasher.cli.upgrade.text import UpgradeDocument, plan_document, upgrade_doc
 from flasher.errors import ExitCode, FlasherError
 from flasher.events import (
     SETTINGS,
+    AdapterBack,
     CheckMade,
     PacketAcknowledged,
     Phase,
@@ -113,6 +117,8 @@ class UpgradeRun:
                                     self._reached(phase, 0)
                                 case PacketAcknowledged(number):
                                     self._reached(Phase.TRANSFER, number)
+                                case AdapterBack():
+                                    self._name_adapter(connection)
                                 case CheckMade():
                                     self.checks.append(event)
                                     record.facts["checks"] = self.checks
@@ -169,6 +175,19 @@ class UpgradeRun:
         if self._saved is not None and result.outcome.ok:
             compare_settings(device, self._saved, on_event, **calls)
         return result
+
+    def _name_adapter(self, connection: Connection) -> None:
+        """Give the commands of an error the name that the adapter came back with: another adapter
+        may have the old one.
+        """
+        channel, ctx = (
+            getattr(connection.link, "channel", ""),
+            click.get_current_context(silent=True),
+        )
+        if ctx is not None and channel != connection.channel:
+            self.output.progress(f"it is {printable(str(connection.link))} now")
+            retype(ctx, "channel", channel)
+            retype(ctx, "interface", self.bus.interface or "")
 
     def _failed(self, error: FlasherError) -> None:
         """Complete an error, with the command that restores the settings."""
