@@ -183,10 +183,14 @@ class FlashHistory:
             folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         lock = FileLock(self._lock_of(name), timeout=0, thread_local=False, mode=0o600)
         with lock:
-            self._add({"flash": name, "event": _BEGAN, **dataclasses.asdict(began)})
+            self.changed(name, began)
             self._held[name] = lock
             lock.acquire()  # a second time, so that it stays locked
         return name
+
+    def changed(self, name: str, began: Began) -> None:
+        """Replace what is recorded of the beginning of the upgrade `name`."""
+        self._add({"flash": name, "event": _BEGAN, **dataclasses.asdict(began)})
 
     def reached(self, name: str, reached: Reached) -> None:
         """Record the progress of the upgrade `name`. Suitable for every packet: nothing is synced,

@@ -18,6 +18,7 @@ from flasher.cli.upgrade import acceptance
 from flasher.cli.upgrade.choices import repair_command
 from flasher.errors import ExitCode
 from flasher.events import Phase
+from flasher.history import FlashHistory
 from flasher.wording import wording
 from tests.cli.conftest import SAMPLES, Flasher
 from tests.end_to_end.stage import IMAGE, SMALL, Stage
@@ -105,6 +106,9 @@ def test_the_command_that_repairs_names_the_adapter_as_it_came_back(
     repair = repair_named_in(failed.err)
     assert repair[repair.index("-c") + 1] == "can3"
     assert "can2" not in repair
+    (flash,) = FlashHistory().flashes()[0]
+    assert flash.began.adapter == "virtual can3"
+    assert "-c can3" in flash.began.again
 
 
 class Renamed(SimulatedLink):

@@ -116,7 +116,6 @@ class BikeUpgrade:
         self._battery = ""
         """Serial number of the battery before the first upgrade; empty if not known."""
 
-    @property
     def _again(self) -> str:
         """Command that goes on with the set."""
         ctx = click.get_current_context()
@@ -324,7 +323,7 @@ class BikeUpgrade:
             ctx = click.get_current_context()
             error.command = repair_command(ctx, is_refused=is_refused, of_set=device.part)
         else:
-            error.command = self._again
+            error.command = self._again()
         error.remedy = error.remedy.replace(f"{AGAIN} ", "")
 
     # -- the result --------------------------------------------------------------------------------

@@ -243,11 +243,14 @@ class _Upgrade:
     def _carry_out(self, job: jobs.Job, profile: Profile) -> int:
         output = self.output
         ctx = click.get_current_context()
-        name, replaced = str(ctx.info_name), image_again(ctx)
-        words = rebuild_command_line(
-            ctx, name, without=TRACE_OPTIONS.__contains__, replaced=replaced
-        )
-        again = shlex.join(["flasher", *words])
+
+        def again() -> str:
+            name, replaced = str(ctx.info_name), image_again(ctx)
+            words = rebuild_command_line(
+                ctx, name, without=TRACE_OPTIONS.__contains__, replaced=replaced
+            )
+            return shlex.join(["flasher", *words])
+
         upgrade_run = UpgradeRun(job, self.bus, self.recorded, output, self._add_repair, again)
         upgrade_run.keeps_settings = self.choices.keeps_settings(profile)
         result = upgrade_run.write_planned(

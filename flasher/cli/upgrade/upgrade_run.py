@@ -59,8 +59,9 @@ class UpgradeRun:
     output: Output
     on_failure: Callable[[FlasherError], None] = lambda _error: None
     """Completes an error before it is recorded."""
-    again: str = ""
-    """Command that repeats the upgrade after this program was killed; empty for the page."""
+    again: Callable[[], str] = lambda: ""
+    """Builds the command that repeats the upgrade after this program was killed; empty for the
+    page."""
     keeps_settings: bool = False
     restore_command: Callable[[Path], str] = restore_command
     """Builds the command that writes saved settings back."""
@@ -73,6 +74,7 @@ class UpgradeRun:
     warning: str = ""
     """Reason why the upgrade is missing in the history; empty if it is there."""
     _history: FlashHistory = field(default_factory=FlashHistory)
+    _at: str = field(default_factory=lambda: _now())  # noqa: PLW0108  defined below
     _name: str | None = None
     """Name in the history; None before the start."""
     _serial_number: str | None = None
@@ -109,7 +111,7 @@ class UpgradeRun:
                         self.job = self.job.in_session()
                     job = self.job
                     with watching(connection, record) as watch:
-                        self._began(connection)
+                        self._began(connection, connection.name)
 
                         def on_event(event: object) -> None:
                             match event:
@@ -177,17 +179,18 @@ class UpgradeRun:
         return result
 
     def _name_adapter(self, connection: Connection) -> None:
-        """Give the commands of an error the name that the adapter came back with: another adapter
-        may have the old one.
+        """Give history and commands the name that the adapter came back with: another adapter may
+        have the old one.
         """
-        channel, ctx = (
-            getattr(connection.link, "channel", ""),
-            click.get_current_context(silent=True),
-        )
-        if ctx is not None and channel != connection.channel:
-            self.output.progress(f"it is {printable(str(connection.link))} now")
+        channel = getattr(connection.link, "channel", "")
+        if channel == connection.channel:
+            return
+        self.output.progress(f"it is {printable(str(connection.link))} now")
+        ctx = click.get_current_context(silent=True)
+        if ctx is not None:  # there is none on the page
             retype(ctx, "channel", channel)
             retype(ctx, "interface", self.bus.interface or "")
+        self._began(connection, str(connection.link))
 
     def _failed(self, error: FlasherError) -> None:
         """Complete an error, with the command that restores the settings."""
@@ -218,27 +221,30 @@ class UpgradeRun:
             with contextlib.suppress(OSError):
                 self._history.reached(self._name, Reached(phase.value, packet))
 
-    def _began(self, connection: Connection) -> None:
-        """Record the start on this adapter."""
+    def _began(self, connection: Connection, adapter: str) -> None:
+        """Record the start on this adapter, or its new name."""
         image = self.job.plan.image
         began = Began(
-            at=_now(),
+            at=self._at,
             command="rescue" if self.job.options.at_power_up else "flash",
             target=self.job.plan.target.name,
             is_virtual=not connection.link.is_physical,
-            adapter=MOCK if self.bus.mock else printable(connection.name),
+            adapter=MOCK if self.bus.mock else printable(adapter),
             image=printable(image.source),
             image_sha256=image.sha256,
             image_size_bytes=image.size_bytes,
             image_version=image.version,
             waived=", ".join(self.job.waived),
-            again=printable(self.again),
+            again=printable(self.again()),
             folder=working_folder(),
             **_signed(self.job),
         )
 
         def write() -> None:
-            self._name = self._history.begin(began)
+            if self._name is None:
+                self._name = self._history.begin(began)
+            else:
+                self._history.changed(self._name, began)
 
         self._carefully(write)
 
