@@ -182,7 +182,7 @@ class UpgradeRun:
         """Give history and commands the name that the adapter came back with: another adapter may
         have the old one.
         """
-        channel = getattr(connection.link, "channel", "")
+        channel = getattr(connection.link, "channel", connection.channel)
         if channel == connection.channel:
             return
         self.output.progress(f"it is {printable(str(connection.link))} now")
