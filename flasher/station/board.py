@@ -377,8 +377,10 @@ class Board:
         return tuple(each for each in self.ended.values() if each.state is not RunState.PASS)
 
 
-def device_event_text(event: LabelFailed | ScannerChanged) -> str:
+def device_event_text(event: LabelFailed | LabelPrinted | ScannerChanged) -> str:
     """Text of an event of a label or a scanner, with its remedy."""
+    if isinstance(event, LabelPrinted):
+        return text("The label of {serial} was printed.", serial=printable(event.serial))
     if isinstance(event, LabelFailed):
         return text(
             "No label for {serial}: {reason} {remedy}",

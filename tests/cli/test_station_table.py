@@ -20,12 +20,13 @@ from flasher.cli.output import Output
 from flasher.cli.station.documents import LINES
 from flasher.cli.station.run import _Session
 from flasher.cli.station.scans import LineReader, ScanFile, Typing
-from flasher.cli.station.views import Table, draw
+from flasher.cli.station.views import Lines, Table, draw
 from flasher.documents import SCHEMA_VERSION
 from flasher.errors import UsageError
 from flasher.station.board import Board
 from flasher.station.events import (
     FiguresChanged,
+    LabelPrinted,
     LineStopped,
     OperatorPrompted,
     Progressed,
@@ -335,6 +336,13 @@ def test_on_a_terminal_the_table_is_refreshed_and_the_summary_stays(
     assert "PASS" in shown
     assert "NONSENSE" in shown, "what is typed is a scan"
     assert "2 units: 2 passed, 0 failed; yield 100 %" in behind
+
+
+def test_lines_answer_who_asks_for_a_label_again(capsys: pytest.CaptureFixture[str]) -> None:
+    view = Lines(Output())
+    for is_reprint in (False, True):
+        view(LabelPrinted("", "W2605002", is_reprint))
+    assert capsys.readouterr().out.split(maxsplit=1)[1:] == ["The label of W2605002 was printed.\n"]
 
 
 @pytest.mark.slow

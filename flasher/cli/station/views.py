@@ -275,7 +275,7 @@ def _words(event: StationEvent) -> Iterator[str]:
             yield f">>> {text}: type the PIN of {person} within {limit_s:.0f} s, or scan CANCEL"
         case events.OperatorPrompted(socket, text):
             yield f">>> {f'socket {socket}: ' if socket else ''}{text}"
-        case events.LabelFailed() | events.ScannerChanged():
+        case events.LabelFailed() | events.LabelPrinted(is_reprint=True) | events.ScannerChanged():
             yield device_event_text(event)
         case events.LineStopped(code, reason, remedy):
             yield f"LINE STOPPED {code}: {reason} {remedy} Then scan RESUME."
