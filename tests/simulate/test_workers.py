@@ -104,15 +104,16 @@ def test_a_run_whose_process_was_killed_from_outside_is_not_blamed(
 def test_workers_that_are_killed_change_nothing() -> None:
     some, results, killed = without_canaries(120, 120), [no_result()], list[int | None]()
 
-    def kill_one(_batch: Batch, result: Result) -> None:
+    def kill_both(_batch: Batch, result: Result) -> None:
         results.append(result)
-        # One that was killed may still be listed.
-        alive = [each for each in multiprocessing.active_children() if each.pid not in killed]
-        if len(killed) < 2 and alive:
-            killed.append(alive[0].pid)
-            alive[0].kill()
+        # Each once: one that is killed twice while it starts ends the campaign.
+        alive = multiprocessing.active_children()
+        if not killed and len(alive) == 2:
+            for each in alive:
+                killed.append(each.pid)
+                each.kill()
 
-    run(some, 2, on_result=kill_one, is_stopped=never, run_one=run_slowly)
+    run(some, 2, on_result=kill_both, is_stopped=never, run_one=run_slowly)
     assert len(set(killed)) == 2
     assert text_of(sum(results[1:], results[0])) == text_of(
         sum(map(run_quickly, some), no_result())
