@@ -9,7 +9,7 @@ import contextlib
 import datetime
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -74,9 +74,10 @@ class UpgradeRun:
     warning: str = ""
     """Reason why the upgrade is missing in the history; empty if it is there."""
     _history: FlashHistory = field(default_factory=FlashHistory)
-    _at: str = field(default_factory=lambda: _now())  # noqa: PLW0108  defined below
     _name: str | None = None
     """Name in the history; None before the start."""
+    _start: Began | None = None
+    """Start as the history has it."""
     _serial_number: str | None = None
     _result: Result | None = None
     _saved: SavedSettings | None = None
@@ -111,7 +112,7 @@ class UpgradeRun:
                         self.job = self.job.in_session()
                     job = self.job
                     with watching(connection, record) as watch:
-                        self._began(connection, connection.name)
+                        self._began(connection)
 
                         def on_event(event: object) -> None:
                             match event:
@@ -190,7 +191,9 @@ class UpgradeRun:
         if ctx is not None:  # there is none on the page
             retype(ctx, "channel", channel)
             retype(ctx, "interface", self.bus.interface or "")
-        self._began(connection, str(connection.link))
+        if self._start is not None:
+            self._start = replace(self._start, adapter=printable(str(connection.link)))
+            self._write_start(self._start)
 
     def _failed(self, error: FlasherError) -> None:
         """Complete an error, with the command that restores the settings."""
@@ -221,15 +224,14 @@ class UpgradeRun:
             with contextlib.suppress(OSError):
                 self._history.reached(self._name, Reached(phase.value, packet))
 
-    def _began(self, connection: Connection, adapter: str) -> None:
-        """Record the start on this adapter, or its new name."""
+    def _began(self, connection: Connection) -> None:
         image = self.job.plan.image
-        began = Began(
-            at=self._at,
+        self._start = Began(
+            at=_now(),
             command="rescue" if self.job.options.at_power_up else "flash",
             target=self.job.plan.target.name,
             is_virtual=not connection.link.is_physical,
-            adapter=MOCK if self.bus.mock else printable(adapter),
+            adapter=MOCK if self.bus.mock else printable(connection.name),
             image=printable(image.source),
             image_sha256=image.sha256,
             image_size_bytes=image.size_bytes,
@@ -239,7 +241,9 @@ class UpgradeRun:
             folder=working_folder(),
             **_signed(self.job),
         )
+        self._write_start(self._start)
 
+    def _write_start(self, began: Began) -> None:
         def write() -> None:
             if self._name is None:
                 self._name = self._history.begin(began)
