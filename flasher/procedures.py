@@ -457,46 +457,30 @@ class Procedures:
                 f"The plan is for {plan.bitrate_bps / 1000:g} kbit/s, the bus runs at {rate}.",
                 remedy="Make the plan with bitrate_bps of the connection.",
             )
-        slept_s = suspended_s()
         session = UpgradeSession(plan, chosen, level, identity or Identity())
-        result = self._session(session, chosen)
-        slept_s = suspended_s() - slept_s
-        if slept_s <= STALL_S:
-            return result
-        # Nothing was received then, and another unit may have been connected.
-        unobserved_s = result.outcome.unobserved_s + slept_s
-        return replace(result, outcome=replace(result.outcome, unobserved_s=unobserved_s))
+        return self._session(session, chosen)
 
     def _session(self, session: UpgradeSession, options: UpgradeOptions) -> Result:
         stalls_s: list[float] = []
-        has_sent = False
 
         def note_stall(event: object) -> None:
             if isinstance(event, events.HostStalled):
                 stalls_s.append(event.stalled_s)
 
-        link = self.link
-
-        def watch_link(frame: Frame, *, sent: bool, now: float) -> None:  # noqa: ARG001  a tap
-            nonlocal has_sent
-            if sent:
-                has_sent = True
-            elif frame.is_error and link.is_off:  # messages are lost until it ends
-                raise bus_off_error(str(link))
-
+        watch = _LinkWatch(self.link)
         may_end = _may_end(session)
-        before = link.health()
+        before = self.link.health()
         self._check_bus("before anything was sent", session, before)
         received: int | None = None
         try:
             while True:
                 try:
-                    self.run(session, taps=(watch_link,), hang_up_ends=may_end, on_event=note_stall)
+                    self.run(session, taps=(watch,), hang_up_ends=may_end, on_event=note_stall)
                     break
                 except TransmitBlockedError as error:
                     received = self._await_contact(session, error, received)
                 except BusError as error:
-                    limit_s = inf if has_sent else BRIEF_ADAPTER_RETURN_S
+                    limit_s = inf if watch.has_sent else BRIEF_ADAPTER_RETURN_S
                     wait_s = min(options.adapter_return_s, limit_s)
                     self._await_adapter(session, error, wait_s)
                 session.link_back(self.clock.now())
@@ -514,7 +498,10 @@ class Procedures:
             )
             _add_device_state(interrupted, session)
             raise interrupted from interrupt
-        result = replace(session.result, stalled_s=sum(stalls_s))
+        outcome, slept_s = session.result.outcome, watch.slept_s()
+        if slept_s > STALL_S:  # nothing was received then, and another unit may have been connected
+            outcome = replace(outcome, unobserved_s=outcome.unobserved_s + slept_s)
+        result = replace(session.result, outcome=outcome, stalled_s=sum(stalls_s))
         silence = result.error()
         if isinstance(silence, NoAnswerError):
             self._check_bus(silence.where, session, before)
@@ -617,6 +604,25 @@ def check_sample(image: Image, link: Link) -> None:
     """Raise ImageError for a firmware sample on a physical adapter."""
     if is_sample(image) and link.is_physical:
         raise sample_error(image, str(link))
+
+
+class _LinkWatch:
+    """Tap of an upgrade that notes its first sent frame, and ends it when the adapter is off."""
+
+    def __init__(self, link: Link) -> None:
+        self.has_sent = False
+        self._link = link
+        self._slept_before_s = 0.0
+
+    def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
+        if sent and not self.has_sent:
+            self.has_sent, self._slept_before_s = True, suspended_s()
+        elif frame.is_error and self._link.is_off:  # messages are lost until it ends
+            raise bus_off_error(str(self._link))
+
+    def slept_s(self) -> float:
+        """Time for which this computer was suspended since the first frame was sent."""
+        return suspended_s() - self._slept_before_s if self.has_sent else 0.0
 
 
 def _may_end(session: UpgradeSession) -> Callable[[], bool]:

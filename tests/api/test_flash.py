@@ -81,6 +81,23 @@ def test_an_upgrade_in_which_this_computer_was_suspended_was_not_observed(
 
 
 @pytest.mark.usefixtures("at_once")
+def test_a_computer_suspended_before_anything_was_sent_leaves_nothing_unobserved(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    total_s = 5.0
+    monkeypatch.setattr("flasher.procedures.suspended_s", lambda: total_s)
+
+    def sleep_while_it_listens(event: object) -> None:
+        nonlocal total_s
+        if isinstance(event, events.PhaseEntered) and event.phase is events.Phase.LISTEN:
+            total_s += 60.0
+
+    done = flasher.flash(IMAGE, "bms", mock=True, on_event=sleep_while_it_listens)
+    assert done.ok
+    assert done.outcome.unobserved_s == 0.0
+
+
+@pytest.mark.usefixtures("at_once")
 def test_a_path_may_be_text_and_an_image_may_be_loaded_before(tmp_path: Path) -> None:
     path = tmp_path / "firmware.bin"
     path.write_bytes(DATA)
