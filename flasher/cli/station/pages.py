@@ -126,7 +126,7 @@ def operator_page(
     for run in store.read.table(RunFilter(since=began)):
         if run.station == store.station and run.state is not RunState.RUNNING:
             tally.add(run)
-    clock, ends_at = station.clock, certificate_end(options)
+    clock, ends_at = station.clock, _certificate_end(options)
     watch = HealthWatch(
         store.files.folder,
         clock.utc,
@@ -221,8 +221,7 @@ def serve(
     ):
         answering.begin()
         output.progress(f"The supervisor pages: {url}; Ctrl-C ends them")
-        for check in certificate_checks(certificate_end(pages), datetime.now(UTC)):
-            output.progress(f"The {check.name} of the pages {check.text}.")
+        report_certificate(pages, output)
         while not stopped():
             time.sleep(_TURN_S)
     return ExitCode.OK
@@ -323,7 +322,13 @@ def _tls(options: PagesOptions) -> Tls | None:
     return Tls(certificate, key)
 
 
-def certificate_end(options: PagesOptions) -> datetime | None:
+def report_certificate(options: PagesOptions, output: Output) -> None:
+    """Report a certificate of the pages that has expired or soon does."""
+    for check in certificate_checks(_certificate_end(options), datetime.now(UTC)):
+        output.progress(f"The {check.name} of the pages {check.text}.")
+
+
+def _certificate_end(options: PagesOptions) -> datetime | None:
     """Time at which the certificate of the pages expires; None without one. `Server` reports a file
     that is none.
     """

@@ -43,7 +43,6 @@ from flasher.station.adapters import Resolved, detect, resolve, with_recipe, wor
 from flasher.station.codes import Code
 from flasher.station.config import MockUnits, StationConfig, load_config, mock_config
 from flasher.station.events import StationEvent
-from flasher.station.health import certificate_checks
 from flasher.station.operators import Crew
 from flasher.station.recipe_file import load_checked
 from flasher.station.records.database import locate_records
@@ -320,8 +319,8 @@ class _Session:
         if address is None:
             return
         from flasher.cli.station.pages import (  # noqa: PLC0415  an extra
-            certificate_end,
             operator_page,
+            report_certificate,
         )
 
         page = operator_page(
@@ -334,8 +333,7 @@ class _Session:
             people=() if self.crew is None else self.crew.people,
         )
         self._page, url = stack.enter_context(page)
-        for check in certificate_checks(certificate_end(self.pages), self.station.clock.utc()):
-            self.output.progress(f"The {check.name} of the pages {check.text}.")
+        report_certificate(self.pages, self.output)
         self.view.board.page = url
 
     def show(self, event: StationEvent) -> None:
