@@ -533,6 +533,31 @@ def test_two_programs_whose_adapters_exchange_their_names_do_not_lock_each_other
         link.close()
 
 
+@pytest.mark.usefixtures("no_configuration")
+def test_an_adapter_that_is_away_does_not_lock_the_one_that_has_its_name_now(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen = [{"can2": A, "can3": B}]
+    monkeypatch.setattr("can.Bus", lambda **_config: FakeBus())
+    monkeypatch.setattr(adapter, "plugged_in", lambda _interface: named(seen[-1]))
+    away, other = (
+        open_adapter(250_000, holder=f"socket {name}", interface="socketcan", channel=name)
+        for name in ("can2", "can3")
+    )
+    seen.append({"can2": B})
+    with pytest.raises(BusError, match="can2 is the name of another adapter now"):
+        away.reopen()
+    other.reopen()
+    assert other.channel == "can2"
+    with pytest.raises(BusError, match="can2 is the name of another adapter now"):
+        away.reopen()  # and it does not unlock what it does not hold
+    with pytest.raises(BusError, match="is in use by"):
+        open_adapter(250_000, holder="another", interface="socketcan", channel="can2")
+    other.send(FRAME)
+    for link in (away, other):
+        link.close()
+
+
 def test_a_link_that_was_handed_a_bus_cannot_be_opened_again(bus: FakeBus) -> None:
     with pytest.raises(BusError, match="cannot be opened again"):
         CanLink(bus, "fake").reopen()

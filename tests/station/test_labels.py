@@ -33,6 +33,7 @@ from flasher.station.health import HealthWatch
 from flasher.station.label_printer import LabelJob, LabelPrinter, NotPrinted, printer_of
 from flasher.station.label_template import LabelTemplate, sample_of, values_of
 from flasher.station.operators import Crew, Person, Role
+from flasher.station.records import queries
 from flasher.station.records.errors import DiskFullError
 from flasher.station.records.model import Measurement, RunState, StepName
 from flasher.station.records.store import Store
@@ -388,6 +389,14 @@ def test_the_next_start_names_each_label_that_a_kill_has_lost(bench: Bench) -> N
     assert bench.store.examine().problems == ()
     assert missing(LineBench(bench, labels=Printer(bench).labels)) == ["W2605004"]
     assert missing(LineBench(bench)) == []
+
+
+def test_the_next_start_looks_for_the_labels_of_so_many_runs_and_no_more(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(queries, "LABELS_LOOKED_BACK", 2)
+    killed_before_the_label(bench, SERIAL, OTHER, "W2605004")
+    assert missing(LineBench(bench, labels=Printer(bench).labels)) == [OTHER, "W2605004"]
 
 
 def test_a_label_of_the_product_before_is_printed_too(bench: Bench) -> None:
