@@ -192,7 +192,11 @@ class UpgradeRun:
             retype(ctx, "channel", channel)
             retype(ctx, "interface", self.bus.interface or "")
         if self._start is not None:
-            self._start = replace(self._start, adapter=printable(str(connection.link)))
+            self._start = replace(
+                self._start,
+                adapter=printable(str(connection.link)),
+                again=printable(self.again()),
+            )
             self._write_start(self._start)
 
     def _failed(self, error: FlasherError) -> None:
