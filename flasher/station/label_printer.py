@@ -58,7 +58,7 @@ class LabelPrinter:
         self._send = send
         self._limit_s = limit_s
         self._wake: Callable[[], None] = lambda: None
-        self._jobs: queue.Queue[LabelJob | None] = queue.Queue(BACKLOG_MAX)
+        self._jobs: queue.SimpleQueue[LabelJob | None] = queue.SimpleQueue()
         self._unfinished: dict[int, LabelJob] = {}
         """Queued labels by `id`. Who removes one reports it."""
         self._done: deque[tuple[LabelJob, str]] = deque()
@@ -73,9 +73,9 @@ class LabelPrinter:
     def submit(self, job: LabelJob) -> None:
         """Queue a label and return at once."""
         self._unfinished[id(job)] = job
-        try:
-            self._jobs.put_nowait(job)
-        except queue.Full:
+        if self._jobs.qsize() < BACKLOG_MAX:
+            self._jobs.put(job)
+        else:
             self._finished(job, text("Too many labels wait for the printer."))
 
     def take(self) -> list[tuple[LabelJob, str]]:
@@ -86,8 +86,7 @@ class LabelPrinter:
         """Print the queued labels within one time limit, and end the thread. `take` has the others
         as failures.
         """
-        with suppress(queue.Full):
-            self._jobs.put_nowait(None)
+        self._jobs.put(None)
         if self._thread.ident is not None:
             self._thread.join(self._limit_s)
         for job in tuple(self._unfinished.values()):

@@ -233,7 +233,6 @@ def test_a_template_that_fails_on_one_unit_is_reported(bench: Bench) -> None:
     assert [event.serial for event in line.of(LabelPrinted)] == [SERIAL]
 
 
-@pytest.mark.slow
 def test_a_backlog_has_an_end(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(label_printer, "BACKLOG_MAX", 1)
     begun, goes_on = threading.Event(), threading.Event()
@@ -242,7 +241,8 @@ def test_a_backlog_has_an_end(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> 
         begun.set()
         goes_on.wait(LIMIT_S)
 
-    line = LineBench(bench, labels=Printer(bench, hang).labels)
+    labels = Printer(bench, hang).labels
+    line = LineBench(bench, labels=labels)
     line.make("A", SERIAL)
     assert begun.wait(LIMIT_S)
     for serial in (OTHER, "W2605004"):
@@ -252,6 +252,7 @@ def test_a_backlog_has_an_end(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> 
     assert [event.serial for event in line.of(LabelFailed)] == ["W2605004"]
     goes_on.set()
     finished(line)
+    assert not labels._thread.is_alive()  # else the station waited for its whole limit
 
 
 def test_labels_that_wait_at_the_end_are_reported(
