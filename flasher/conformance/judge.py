@@ -164,13 +164,14 @@ class Judge:
         while received is not None and received.kind in ignoring and received.kind is not kind:
             received = self._tester.next_message(deadline - self._tester.now)
         found = self.require_received(received, expected, limit_s)
-        has_left = found.kind is Reply.BOOT_VERSION and kind in _IN_TRANSFER
-        by = self._ends_of_transfer() if has_left else None
+        by = self.ends_of_transfer([found]) if kind in _IN_TRANSFER else None
         self.require(found.kind is kind and number in (None, found.number), expected, found, by=by)
         return found
 
-    def _ends_of_transfer(self) -> dict[str, str | float]:
-        """The keys that decide whether a device may leave a transfer."""
+    def ends_of_transfer(self, replies: Sequence[Received]) -> dict[str, str | float] | None:
+        """The keys that decide whether a device may leave a transfer, when it announces itself."""
+        if all(one.kind is not Reply.BOOT_VERSION for one in replies):
+            return None
         profile = self._tester.profile
         pause = {"tx_12": profile.choice("tx_12"), "tx_13": profile.choice("tx_13")}
         return {**pause, **limits_of(profile.limit("pause_s"))}

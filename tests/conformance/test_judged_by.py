@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
@@ -11,14 +12,14 @@ from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import Selection
 from flasher.conformance.html_report import html_page
 from flasher.conformance.judge import TimeName
-from flasher.conformance.mock import profile_of_mock
+from flasher.conformance.mock import MOCK_PROFILE, profile_of_mock
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.profile_time import limits_of
 from flasher.conformance.reports import junit_report, to_json
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
 from flasher.conformance.wire import Reply
-from tests.conformance.bench import one, run_case, subject
+from tests.conformance.bench import NOTHING_STATED, one, run_case, subject
 from tests.loops import each
 
 
@@ -123,6 +124,14 @@ def test_the_clock_of_the_bench_knows_no_limit() -> None:
     device = subject()
     run(device, profile_of_mock(), selection=Selection(cases=("BU-02", "RS-01")))
     assert limits_of(device.port.now()) == {}
+
+
+def test_an_announcement_among_damaged_packets_names_the_pause() -> None:
+    impatient = replace(MOCK_PROFILE, transfer_timeout_s=0.4)
+    report = run(subject(profile=impatient), NOTHING_STATED, selection=Selection(cases=("CR-03",)))
+    failure = one(report, "CR-03").first_failure
+    assert failure is not None
+    assert failure.judged_by == {"tx_12": "either", "tx_13": "either", "limits.pause_s": 5.0}
 
 
 def test_a_passed_check_names_no_key() -> None:

@@ -418,4 +418,5 @@ def _late_answers(bench: Bench) -> list[Received]:
 def _require_none_accepted(bench: Bench, what: str, replies: Sequence[Received]) -> None:
     """Require NAK or silence; TX-01 checks which, and with which number."""
     if any(one.kind is not Reply.NAK for one in replies):
-        bench.require(False, f"NAK or no answer to {what}", describe(replies))  # noqa: FBT003
+        by = bench.judge.ends_of_transfer(replies)
+        bench.require(False, f"NAK or no answer to {what}", describe(replies), by=by)  # noqa: FBT003

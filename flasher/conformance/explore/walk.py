@@ -274,8 +274,9 @@ class Walk:
             return
         is_expected = self._may_restart or self.phase is DevicePhase.UNCLEAR
         if self.phase is not DevicePhase.ANNOUNCING and not is_expected:
-            raise Violation("restart", f"{reply} without reset, pause or power cycle, phase: "
-                            f"{self.phase.value}")  # fmt: skip
+            pause_s = self.bench.limit("pause_s")
+            raise Violation("restart", f"{reply} without reset, power cycle or pause "
+                            f"(limits.pause_s = {pause_s:g}), phase: {self.phase.value}")  # fmt: skip
         if reply.boot_name != self.bench.encoder.boot_name or not reply.has_good_version_text:
             raise Violation("form", f"{reply} is not a valid boot version of this device")
         is_burst = reply.at - self._version_at < self.bench.waits.next_version_s
