@@ -9,8 +9,8 @@ import pytest
 
 from flasher.conformance.catalogue import CASES, GROUPS, Selection, group_of
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
-from flasher.conformance.profile import profile_keys
-from flasher.conformance.results import CaseVerdict
+from flasher.conformance.profile import ConformanceProfile, profile_keys
+from flasher.conformance.results import CaseVerdict, CheckOutcome
 from flasher.conformance.runner import run
 from tests.loops import each
 
@@ -72,3 +72,15 @@ def test_every_case_states_all_that_a_report_shows() -> None:
         assert group_of(case_id) in GROUPS
         assert all((case.title, case.clause, case.stimulus, case.expectation)), case_id
         assert set(case.choices) <= set(profile_keys()), case_id
+
+
+@each("choice, is_right, expected", (("once", True, "once"), ("each", False, "twice")))
+def test_a_repeated_update_command_names_how_often_it_is_answered(
+    choice: str, is_right: bool, expected: str
+) -> None:
+    profile = ConformanceProfile({**profile_of_mock().given, "up_05": choice})
+    report = run(MockSubject("bms"), profile, selection=Selection(("UP-05",)))
+    (check,) = (one for one in report.results[0].checks if one.expected.endswith(expected))
+    assert check.expected == f"request transfer {expected}"
+    assert check.got == "once"
+    assert (check.outcome is CheckOutcome.PASS) == is_right

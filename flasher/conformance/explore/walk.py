@@ -275,8 +275,8 @@ class Walk:
         is_expected = self._may_restart or self.phase is DevicePhase.UNCLEAR
         if self.phase is not DevicePhase.ANNOUNCING and not is_expected:
             pause_s = self.bench.limit("pause_s")
-            raise Violation("restart", f"{reply} without reset, power cycle or pause "
-                            f"(limits.pause_s = {pause_s:g}), phase: {self.phase.value}")  # fmt: skip
+            why = f"without reset, power cycle or pause (limits.pause_s = {pause_s:g})"
+            raise Violation("restart", f"{reply} {why}, phase: {self.phase.value}")
         if reply.boot_name != self.bench.encoder.boot_name or not reply.has_good_version_text:
             raise Violation("form", f"{reply} is not a valid boot version of this device")
         is_burst = reply.at - self._version_at < self.bench.waits.next_version_s
