@@ -88,6 +88,7 @@ def open_adapter(
     holder: str | None = None,
     sends: bool = True,
     listen_only: bool = False,
+    by_place: bool = False,
     fallback: Fallback | None = None,
     **config: Any,
 ) -> CanLink:
@@ -97,7 +98,8 @@ def open_adapter(
     `default_bitrate_bps` is the dialect's bit rate, which applies unless `config` names another
     one. `holder` locks the adapter until it is closed (`lock.acquire`). With `sends`, an interface
     in listen-only mode is refused. `listen_only` keeps the adapter from acknowledging, if its back
-    end supports that (`opening.can_listen_only`).
+    end supports that (`opening.can_listen_only`). A lost adapter is found again by its serial
+    number if it has one; with `by_place`, by its USB path, whatever its serial number is.
 
     Raises UsageError for an unknown interface or an invalid bit rate; BusError if the bit rate
     differs, the adapter cannot be opened, or another program holds it.
@@ -114,7 +116,7 @@ def open_adapter(
         nonlocal place, release
         try:
             if known is not None:
-                name = _find_again(known, has_twin=has_twin)
+                name = _find_again(known, by_place=by_place, has_twin=has_twin)
                 given, *rate_of_port = channel.partition("@")  # slcan: DEVICE@BAUDRATE
                 name = "".join((given if name == known.channel else name, *rate_of_port))
                 link.channel = merged["channel"] = settings["channel"] = name
@@ -153,13 +155,16 @@ def open_adapter(
     return link
 
 
-def _find_again(known: DetectedAdapter, *, has_twin: bool) -> str:
+def _find_again(known: DetectedAdapter, *, by_place: bool, has_twin: bool) -> str:
     """Return the channel of an adapter, whose name may have changed when it was plugged in again.
     Ports that cannot be told apart keep their names. Raises BusError if another adapter has its
     name now.
     """
     found = plugged_in(known.interface)
-    same = [each for each in found if each.identity == known.identity]
+    if by_place:
+        same = [each for each in found if each.place == known.place]
+    else:
+        same = [each for each in found if each.identity == known.identity]
     if has_twin or len(same) > 1:  # makers may give all adapters one serial number
         same = [each for each in same if each.usb_path == known.usb_path]
     if len(same) == 1:

@@ -84,6 +84,11 @@ class DetectedAdapter:
         return (mark, str(self.details.get(_INDEX, ""))) if mark else ("", "")
 
     @property
+    def place(self) -> tuple[str, str]:
+        """USB path, and index of the channel in the adapter."""
+        return self.usb_path, str(self.details.get(_INDEX, ""))
+
+    @property
     def bus_kwargs(self) -> dict[str, Any]:
         """Bus arguments besides interface and channel that open this adapter."""
         names = _CHOOSING.get(self.interface, ())

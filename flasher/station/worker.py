@@ -402,7 +402,8 @@ def open_socket(
     holder = f"flasher station, socket {setup.socket}"
     dialect = recipe.targets[0].profile.dialect
     (socket,) = resolve([setup.adapter], detect([setup.adapter]))
-    with connect(dialect, holder=holder, **(socket.bus or {})) as connection:
+    by_place = bool(setup.adapter.usb_path)
+    with connect(dialect, holder=holder, by_place=by_place, **(socket.bus or {})) as connection:
         yield connection, None
 
 

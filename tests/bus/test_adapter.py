@@ -471,6 +471,35 @@ def test_a_lost_adapter_is_found_again_by_its_serial_number_and_never_by_its_nam
 
 @pytest.mark.usefixtures("no_configuration")
 @each(
+    "before, after, channel",
+    [
+        ({"can2": A, "can3": B}, {"can2": {**B, "usb_path": "1-1"}, "can3": TWIN}, "can2"),
+        ({"can2": A}, {"can2": TWIN, "can3": {**B, "usb_path": "1-1"}}, "can3"),
+        ({"can2": A}, {"can2": TWIN}, None),
+        ({"can2": A, "can3": SECOND}, {"can2": SECOND, "can3": A}, "can3"),
+    ],
+)
+def test_an_adapter_that_is_named_by_its_place_is_found_again_there_whatever_its_number(
+    monkeypatch: pytest.MonkeyPatch,
+    before: dict[str, dict[str, str]],
+    after: dict[str, dict[str, str]],
+    channel: str | None,
+) -> None:
+    monkeypatch.setattr("can.Bus", lambda **_config: FakeBus())
+    monkeypatch.setattr(adapter, "plugged_in", lambda _interface: named(before))
+    link = open_adapter(250_000, by_place=True, interface="socketcan", channel="can2")
+    monkeypatch.setattr(adapter, "plugged_in", lambda _interface: named(after))
+    if channel is None:
+        with pytest.raises(BusError, match="can2 is the name of another adapter now"):
+            link.reopen()
+    else:
+        link.reopen()
+        assert link.channel == channel
+    link.close()
+
+
+@pytest.mark.usefixtures("no_configuration")
+@each(
     "given, name, again",
     [
         ("/dev/ttyACM0@115200", "/dev/ttyACM0", "/dev/ttyACM1@115200"),

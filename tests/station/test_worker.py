@@ -358,6 +358,27 @@ def test_an_adapter_that_has_another_name_now_is_still_the_sockets(
         with open_socket(setup, socket.recipe):
             pass
     assert [bus["channel"] for bus in opened] == ["can2", "can3"]
+    assert not any(bus["by_place"] for bus in opened)
+
+
+def test_the_adapter_of_a_socket_that_names_a_place_is_opened_again_by_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    socket = RealAdapter(tmp_path)
+    place = SocketConfig(name="A", interface="socketcan", usb_path="1-1")
+    found = [DetectedAdapter("socketcan", "can2", {"serial_number": "7", "usb_path": "1-1"})]
+    opened: list[dict[str, Any]] = []
+
+    @contextmanager
+    def connect(_dialect: object, **bus: Any) -> Iterator[Connection]:
+        opened.append(bus)
+        yield socket.connection()
+
+    monkeypatch.setattr("flasher.station.worker.connect", connect)
+    monkeypatch.setattr("flasher.station.adapters.network_adapters", lambda _network: found)
+    with open_socket(replace(socket.setup, adapter=place), socket.recipe):
+        pass
+    assert [(bus["channel"], bus["by_place"]) for bus in opened] == [("can2", True)]
 
 
 def test_a_socket_that_cannot_be_used_is_reported_and_not_tried_again(tmp_path: Path) -> None:
