@@ -5,8 +5,9 @@ The device stays reachable all the same, and never starts a mixture of two image
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, NamedTuple
 
 from flasher.conformance.bench import Bench
@@ -80,9 +81,10 @@ class _InterruptedUpgrade:
     "power cuts in an upgrade",
     clause="R14; R19",
     stimulus="power cut at the frames of reset, update command, packets and end of transfer; while "
-    "it erases, just after complete; before, in and after every flash operation, also of those "
-    f"after complete, once and three times in a row; in {_JOURNAL_UPGRADES} upgrades, each flash "
-    "operation that the others do not have",
+    "it erases, just after complete; before, in and after every flash operation (of many, the "
+    f"first {_OPERATIONS_MAX}, and {_OPERATIONS_MAX} between end of transfer and complete), also "
+    f"of those after complete, once and three times in a row; in {_JOURNAL_UPGRADES} upgrades, "
+    "each flash operation that the others do not have",
     expectation="the device announces itself again, starts only complete images, and can be "
     "upgraded; acknowledged packets are stored, and a completed image runs",
     requires={DESTRUCTIVE, POWER, LONG},
@@ -353,27 +355,80 @@ def _cut_operations(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
     for operation in range(_OPERATIONS_MAX):
         for share in _SHARES:
             with bench.step(f"flash operation {operation + 1}, {share:.0%} of it done"):
-                if not upgrade.was_requested:
-                    _restore_old_image(bench, upgrade)
-                if upgrade.runs:
-                    bench.reset_to_window()
-                upgrade.end_was_sent = False
+                _begin(bench, upgrade)
                 bench.subject.cut_in_operation(operation, share, _OFF_S)
-                version = _upgrade_until_cut(bench, upgrade)
-                if not bench.subject.take_cut():
-                    got = "boot version, and no power cut"
-                    bench.require(version is None, "the update command is accepted", got)
-                    # The upgrade finished without a cut; EN-01 and EN-07 judge its result.
-                    upgrade.runs = bench.application_runs()
+                if not _was_cut(bench, upgrade, _upgrade_until_cut(bench, upgrade)):
                     upgrade.operations = operation
-                    upgrade.swap()
                     return
-                _check_after_cut(bench, upgrade, version)
-    bench.info(f"only the first {_OPERATIONS_MAX} flash operations of the upgrade were cut")
+    _cut_end(bench, upgrade)
 
 
-def _upgrade_until_cut(bench: Bench, upgrade: _InterruptedUpgrade) -> Received | None:
-    """Upgrade until the device announces itself again; None when the upgrade was completed."""
+def _cut_end(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
+    """Cut the power in the flash operations between end of transfer and complete."""
+    counts: dict[bytes, int] = {}
+    if (faults := bench.subject.flash_faults) is not None:
+        while upgrade.new not in counts:
+            _begin(bench, upgrade)
+            version = _upgrade_until_cut(bench, upgrade, at_end=lambda: faults.fail(None))
+            calls = faults.calls
+            counts[upgrade.new] = calls[FlashCall.ERASE] + calls[FlashCall.WRITE]
+            _was_cut(bench, upgrade, version)
+    for index in range(_OPERATIONS_MAX):
+        for share in _SHARES:
+            # An image that was completed before its cut has changed places with the other one.
+            operation = _sampled(index, counts.get(upgrade.new, 0))
+            named = f"flash operation {operation + 1} after end of transfer"
+            with bench.step(f"{named}, {share:.0%} of it done"):
+                _begin(bench, upgrade)
+                cut = partial(bench.subject.cut_in_operation, operation, share, _OFF_S)
+                if not _was_cut(bench, upgrade, _upgrade_until_cut(bench, upgrade, at_end=cut)):
+                    return
+    bench.info(
+        f"of many flash operations the first {_OPERATIONS_MAX} of the upgrade were cut, and "
+        f"{_OPERATIONS_MAX} between end of transfer and complete"
+    )
+
+
+def _sampled(index: int, count: int) -> int:
+    """Operation number `index` of those to cut: of more than are tried, some at the beginning, some
+    spread over all, and the last ones.
+    """
+    third = _OPERATIONS_MAX // 3
+    if count <= _OPERATIONS_MAX or index < third:
+        return index
+    if index < 2 * third:
+        return count * (index - third + 1) // (third + 1)
+    return count - _OPERATIONS_MAX + index
+
+
+def _begin(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
+    """Get a device that takes an update command."""
+    if not upgrade.was_requested:
+        _restore_old_image(bench, upgrade)
+    if upgrade.runs:
+        bench.reset_to_window()
+    upgrade.end_was_sent = False
+
+
+def _was_cut(bench: Bench, upgrade: _InterruptedUpgrade, version: Received | None) -> bool:
+    """Check the device after the cut; False when the upgrade was completed without it."""
+    if bench.subject.take_cut():
+        _check_after_cut(bench, upgrade, version)
+        return True
+    got = "boot version, and no power cut"
+    bench.require(version is None, "the update command is accepted", got)
+    # EN-01 and EN-07 judge its result.
+    upgrade.runs = bench.application_runs()
+    upgrade.swap()
+    return False
+
+
+def _upgrade_until_cut(
+    bench: Bench, upgrade: _InterruptedUpgrade, *, at_end: Callable[[], None] = lambda: None
+) -> Received | None:
+    """Upgrade until the device announces itself again; None when the upgrade was completed.
+    `at_end` is called before end of transfer.
+    """
     limit = bench.limit
     back_s = _OFF_S + limit("first_version_s")
     bench.forget()
@@ -388,6 +443,7 @@ def _upgrade_until_cut(bench: Bench, upgrade: _InterruptedUpgrade) -> Received |
     if reply is None or reply.kind is Reply.BOOT_VERSION:
         return reply
     upgrade.end_was_sent = True
+    at_end()
     bench.send(bench.encoder.end())
     reply = bench.wait_for(
         Reply.COMPLETE, Reply.BOOT_VERSION, within_s=limit("complete_s") + back_s
