@@ -323,8 +323,10 @@ class CanLink:
         return count
 
     def close(self) -> None:
-        """Shut the adapter down and unlock it; failures are ignored."""
+        """Shut the adapter down and unlock it; failures are ignored. It cannot be reopened."""
+        self._open_again = _open_closed  # an upgrade would open it without its lock
         self._shut_down()
+        self._use(None)
         self._release()
 
     def _shut_down(self) -> None:
@@ -500,6 +502,16 @@ def _moment_of(message: can.Message) -> float | None:
 def _no_bus(*_arguments: object, **_options: object) -> NoReturn:
     """Replaces send and receive while the adapter is gone."""
     raise can.CanOperationError("it is not open")
+
+
+def _open_closed() -> NoReturn:
+    """Replaces opening again once the adapter was closed."""
+    raise BusError(
+        "The connection to the adapter was closed.",
+        cause="it is used after the end of its block",
+        remedy="Open a new connection.",
+        code=ErrorCode.ADAPTER_LOST,
+    )
 
 
 def _reported_state(bus: can.BusABC | None, interface: str) -> ControllerState:

@@ -168,3 +168,7 @@ def test_an_open_adapter_is_held_over_a_reopening_and_until_it_is_closed() -> No
     link.close()
     link.close()
     assert is_free(config)
+    with pytest.raises(BusError, match="was closed"):
+        link.reopen()
+    with pytest.raises(BusError, match="it is not open"):
+        link.receive(0.0)
