@@ -22,6 +22,7 @@ from flasher.protocol.fields import (
     Content,
     DateField,
     ReservedField,
+    WireText,
     label,
 )
 from flasher.protocol.spec import Dialect, Mode, Node, Target
@@ -152,23 +153,30 @@ def make_content(writable: Writable, values: Sequence[object]) -> Content:
         name: _value(label(name, codec), codec, value)
         for (name, codec), value in zip(fields, values, strict=True)
     }
-    content = writable.item.content
+    return check_content(writable, writable.item.content(**by_name))
+
+
+def check_content(writable: Writable, content: Content) -> Content:
+    """Return the content as it is read back. Raises UsageError if a value does not fit."""
     try:
-        return content.from_data(content(**by_name).data())
+        return content.from_data(content.data())
     except ValueError as error:
         raise UsageError(f"{writable.name}: {error}.") from error
 
 
 def _value(name: str, codec: Codec, value: object) -> Any:
+    is_bytes = isinstance(codec, BytesField)
+    wanted = f"{codec.size_bytes} bytes in hexadecimal" if is_bytes else "a text"
     if isinstance(codec, DateField) and isinstance(value, str):
         return check_date(value)
-    if not isinstance(codec, BytesField) or not isinstance(value, str):
-        return value
-    try:
-        return bytes.fromhex(value.removeprefix("0x").replace(":", " "))
-    except ValueError as error:
-        wanted = f"{codec.size_bytes} bytes in hexadecimal"
-        raise UsageError(f"{name}: {value!a} is not {wanted}.") from error
+    if is_bytes and isinstance(value, str):
+        try:
+            return bytes.fromhex(value.removeprefix("0x").replace(":", " "))
+        except ValueError as error:
+            raise UsageError(f"{name}: {value!a} is not {wanted}.") from error
+    if not isinstance(value, bytes | bytearray if is_bytes else str | WireText):
+        raise UsageError(f"{name}: {value!a} is not {wanted}.")
+    return value
 
 
 def check_date(text: str) -> str:

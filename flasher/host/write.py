@@ -9,7 +9,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from flasher.errors import ErrorCode, FlasherError, UsageError, VerificationError
-from flasher.host.items import Writable, find_item, make_content, meaningful_fields, writable
+from flasher.host.items import (
+    Writable,
+    check_content,
+    find_item,
+    make_content,
+    meaningful_fields,
+    writable,
+)
 from flasher.protocol.fields import Content, label
 from flasher.protocol.spec import BMS, WELLING, Dialect, Target
 from flasher.validation import json_keys
@@ -109,6 +116,7 @@ def plan_write(
         )
     if len(values) == 1 and isinstance(values[0], chosen.item.content):
         content: Content = values[0]
+        check_content(chosen, content)
     else:
         content = make_content(chosen, values)
     return WritePlan(target, dialect, chosen, content)

@@ -164,11 +164,16 @@ def test_a_write_is_seen_through_once_it_has_begun() -> None:
         ("serial-number", (), "takes 1 value; no value was given"),
         ("check-code", ("0011",), "2 bytes, not 12"),
         ("check-code", ("xyz",), "12 bytes in hexadecimal"),
+        ("check-code", (12,), "12 is not 12 bytes in hexadecimal"),
+        ("check-code", (contents.CheckCode(b"\x5a"),), "1 bytes, not 12"),
+        ("serial-number", (2605001,), "2605001 is not a text"),
+        ("user-string-1", (None,), "None is not a text"),
+        ("production-information", ("A", "B", 20260517), "20260517 is not a text"),
         ("reset", (), "nothing called 'reset'"),
     ],
 )
 def test_values_that_do_not_fit_are_refused_before_anything_is_sent(
-    name: str, values: tuple[str, ...], says: str
+    name: str, values: tuple[object, ...], says: str
 ) -> None:
     battery = Battery()
     with pytest.raises(UsageError, match=says):
