@@ -99,6 +99,8 @@ P = ParamSpec("P")
 C = TypeVar("C", bound=Content)
 _TURN_PAUSE_S: Final = 0.01
 """Interval at which a call checks whether another one has ended, and whether it was cancelled."""
+_OF_DEVICE: Final = CallOptions.__annotations__.keys() | {"profile", "is_alone", "in_session"}
+"""Keywords of a device and its calls that `flash` does not take, and python-can would ignore."""
 _LOOP_GONE_S: Final = 5.0
 """Time without a handled event after which an event loop has ended."""
 
@@ -301,6 +303,7 @@ class Device:
         self._is_alone = is_alone
         self._watch = watch
         self._awaits_turn = awaits_turn
+        _check_keywords(watch)
 
     @property
     def target(self) -> Target:
@@ -502,6 +505,7 @@ class Device:
     @contextmanager
     def _turn(self, of_call: CallOptions) -> Iterator[Procedures]:
         """Run a call while no other call is running on the connection."""
+        _check_keywords(of_call)
         watch: CallOptions = {**self._watch, **of_call}
         turn = self.connection._turn  # noqa: SLF001  of this module
         cancelled = watch.get("cancelled")
@@ -518,6 +522,12 @@ class Device:
             yield self._steps(watch)
         finally:
             turn.release()
+
+
+def _check_keywords(watch: CallOptions) -> None:
+    """Raise TypeError for a keyword that is none of `CallOptions`; it would have no effect."""
+    for name in watch.keys() - CallOptions.__annotations__.keys():
+        raise TypeError(f"unexpected keyword argument {name!r}")
 
 
 def _in_thread(
@@ -666,6 +676,8 @@ def flash(
     `bus` are python-can's keywords, as for `connect`; `mock` upgrades the built-in device model
     instead. An unusable image is refused before the bus is opened.
     """
+    for name in bus.keys() & _OF_DEVICE:
+        raise TypeError(f"flash() does not take {name!r}: use a device of `connect`")
     profile = _default_profile(target, dialect)
     job = prepare(
         image,

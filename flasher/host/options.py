@@ -11,8 +11,8 @@ from flasher.i18n import text
 from flasher.image.plan import Plan
 from flasher.protocol.catalogue import BY_KEY
 from flasher.protocol.fields import Content
-from flasher.protocol.spec import Command, Target
-from flasher.protocol.text import printable
+from flasher.protocol.spec import Command, Target, data_size
+from flasher.protocol.text import BOOT_VERSION_FORM, boot_version_number, printable
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 
 DEFAULT_ATTEMPTS: Final = 3
@@ -42,7 +42,8 @@ PACKET_GAP_MAX_S: Final = 10.0
 class UpgradeOptions:
     """Options of an upgrade, from user and target profile.
 
-    Raises UsageError for gaps that make an upgrade impossible.
+    Raises UsageError for gaps that make an upgrade impossible, a boot version of another form, and
+    reset data that the command does not carry.
     """
 
     timings: Timings = DEFAULT_TIMINGS
@@ -95,6 +96,15 @@ class UpgradeOptions:
                 f"{self.timings.inter_frame_timeout_s:g} s apart",
                 remedy="Choose a shorter --frame-gap (frame_gap_s in a profile); a device that is "
                 "slow between packets needs --packet-gap.",
+            )
+        minimum = self.minimum_boot_version
+        if minimum is not None and boot_version_number(minimum) is None:  # it would pass any
+            raise UsageError(f"{minimum!a} is not a boot version of the form {BOOT_VERSION_FORM}.")
+        if len(self.reset_data) != data_size(self.reset_command):
+            raise UsageError(
+                f"The reset data have {len(self.reset_data)} bytes, but the command "
+                f"0x{self.reset_command:04X} carries {data_size(self.reset_command)}, by its "
+                "second byte."
             )
         if not 0 <= self.packet_gap_s <= PACKET_GAP_MAX_S:
             raise UsageError(

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final, Self
 
+from flasher.errors import UsageError
 from flasher.protocol.spec import TARGETS, Target
 from flasher.protocol.text import find_firmware_version, firmware_version_spans
 
@@ -56,7 +57,11 @@ class Image:
 
     @classmethod
     def from_bytes(cls, data: bytes, *, base: int | None = None, source: str = "(memory)") -> Self:
-        """Create an image from bytes, as from a raw binary file."""
+        """Create an image from bytes, as from a raw binary file. Raises UsageError for a base that
+        leaves no 32-bit addresses for them.
+        """
+        if base is not None and not 0 <= base <= ADDRESS_SPACE - len(data):
+            raise UsageError(f"{source} is not inside 32-bit addresses with the base {base:#x}")
         return cls(
             data=data,
             base=base,

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import random
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -119,3 +121,24 @@ def test_a_call_from_within_another_one_is_refused_and_does_no_harm() -> None:
         assert device.flash(IMAGE, on_event=ask).ok
         assert "one call after the other" in refused[0].remedy
         device.read("history")
+
+
+def test_a_misspelled_keyword_is_refused_and_not_ignored() -> None:
+    connection = wire_to(Battery())
+    calls: list[Callable[..., object]] = [
+        connection.device("bms").flash,
+        connection.device("bms").verify,
+        lambda _image, **watch: connection.device("bms").read("model", **watch),
+        lambda _image, **watch: connection.device("bms", **watch),
+        lambda _image, **watch: connection.async_device("bms", **watch),
+    ]
+    for call in calls:
+        with pytest.raises(TypeError, match="unexpected keyword argument 'verfy'"):
+            call(IMAGE, verfy="memory")
+
+
+@pytest.mark.parametrize("name", ["cancelled", "taps", "in_session", "profile"])
+def test_flash_refuses_what_only_a_device_takes(name: str) -> None:
+    keywords: dict[str, Any] = {name: None}
+    with pytest.raises(TypeError, match=f"flash.. does not take '{name}'"):
+        flasher.flash(IMAGE, "bms", mock=True, **keywords)

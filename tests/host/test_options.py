@@ -51,6 +51,18 @@ def test_gaps_that_no_upgrade_survives_are_refused(changes: dict[str, float], er
         UpgradeOptions(**changes)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("minimum", ["1.0.0", "V1.0", "v1.0.0", "V1.0.0 ", "V10.0.0", ""])
+def test_an_oldest_bootloader_that_cannot_be_compared_is_refused(minimum: str) -> None:
+    with pytest.raises(UsageError, match=r"not a boot version of the form Vx\.x\.x"):
+        UpgradeOptions(minimum_boot_version=minimum)
+
+
+def test_a_reset_whose_data_the_command_does_not_carry_is_refused() -> None:
+    UpgradeOptions(reset_command=0x4200, reset_data=b"")
+    with pytest.raises(UsageError, match="have 5 bytes, but the command 0x4207 carries 7"):
+        UpgradeOptions(reset_command=0x4207)
+
+
 @each(
     "options, tries",
     [

@@ -518,6 +518,13 @@ def test_a_file_has_so_many_lines_and_no_more(
         load(path)
 
 
+@pytest.mark.parametrize("base", [-1, 0xFFFF_FFF1, 1 << 32])
+def test_bytes_in_memory_have_32_bit_addresses(base: int) -> None:
+    assert Image.from_bytes(bytes(16), base=0xFFFF_FFF0).base == 0xFFFF_FFF0
+    with pytest.raises(UsageError, match=f"not inside 32-bit addresses with the base {base:#x}"):
+        Image.from_bytes(bytes(16), base=base)
+
+
 def test_a_raw_binary_may_end_with_the_last_address(tmp_path: Path) -> None:
     path = tmp_path / "top.bin"
     path.write_bytes(b"\1\2" * 8)
