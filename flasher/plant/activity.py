@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, time
+from datetime import datetime, time
 from typing import Any, Final
 
 from sqlalchemy import Connection, text
 
 from flasher.station.records.model import (
+    CLOCK_TOLERANCE,
     Moment,
     RunFilter,
     RunKind,
@@ -18,6 +19,7 @@ from flasher.station.records.model import (
     Units,
     local_moment,
     utc_moment,
+    utc_text,
 )
 from flasher.station.records.yields import Span, units_in
 from flasher.station.shift_counts import shift_began
@@ -28,7 +30,8 @@ SELECT n.id AS station_id, n.name AS station, s.name AS socket, r.id, u.serial, 
     r.begun_at
 FROM socket s JOIN station n ON n.id = s.station_id CROSS JOIN LATERAL (
     SELECT id, unit_id, state, code, begun_at FROM run
-    WHERE socket_id = s.id AND kind <> '{RunKind.GOLDEN}' ORDER BY id DESC LIMIT :runs
+    WHERE socket_id = s.id AND kind <> '{RunKind.GOLDEN}' AND begun_at < :until
+    ORDER BY id DESC LIMIT :runs
 ) r JOIN unit u ON u.id = r.unit_id ORDER BY n.name, s.name, r.id DESC
 """)  # noqa: S608  a constant
 
@@ -75,11 +78,13 @@ def activities(
     """
     day = local_moment(datetime.combine(now.astimezone(), time()))
     shift = shift_began(shifts, now) or day
-    spans = [Span(begin, datetime.max.replace(tzinfo=UTC)) for begin in (shift, day)]
-    chosen = RunFilter(since=min(day, shift))
+    # A later run is one of a clock that was ahead.
+    until = now + CLOCK_TOLERANCE
+    spans = [Span(begin, until) for begin in (shift, day)]
+    chosen = RunFilter(since=min(day, shift), until=until)
     yields = dict(units_in(connection, chosen, spans, by_station=True))
     sockets: dict[Any, dict[str, list[RecentRun]]] = defaultdict(lambda: defaultdict(list))
-    for row in connection.execute(_LAST, {"runs": runs}):
+    for row in connection.execute(_LAST, {"runs": runs, "until": utc_text(until)}):
         made = RecentRun(
             row.id, row.serial, RunState(row.state), row.code, utc_moment(row.begun_at)
         )

@@ -108,12 +108,17 @@ class Retirement:
 
     def months(self, before: str) -> list[DueMonth]:
         """Months before `before` with what would be retired of them; nothing is changed."""
-        month = func.substr(chain_row.c.at, 1, 7).label("month")
-        same = chain_row.alias()
-        newest = select(func.max(same.c.number)).where(same.c.station == chain_row.c.station)
+        row, month = chain_row.c, func.substr(chain_row.c.at, 1, 7).label("month")
+        # As `_chains`: what follows a younger row, or is the newest one, stays.
+        younger = func.min(row.number).filter(row.at >= before)
+        ends = (
+            select(row.station, func.coalesce(younger, func.max(row.number)).label("number"))
+            .group_by(row.station)
+            .subquery()
+        )
         query = (
-            select(month, func.count(), func.count(chain_row.c.content))
-            .where(chain_row.c.at < before, chain_row.c.number < newest.scalar_subquery())
+            select(month, func.count(), func.count(row.content))
+            .join(ends, (ends.c.station == row.station) & (row.number < ends.c.number))
             .group_by(month)
             .order_by(month)
         )

@@ -9,6 +9,7 @@ from datetime import datetime, time, timedelta
 from typing import Final, NamedTuple
 
 from flasher.station.records.model import (
+    CLOCK_TOLERANCE,
     RunKind,
     RunRecord,
     RunState,
@@ -73,7 +74,9 @@ class ShiftCounts:
         """Figures at `now`, which has a time zone."""
         began = self.began(now)
         hour = now.replace(minute=0, second=0, microsecond=0)
-        self._runs = runs = [run for run in self._runs if _at(run) >= min(began, hour)]
+        # A later run is one of a clock that was ahead.
+        end = now + CLOCK_TOLERANCE
+        self._runs = runs = [run for run in self._runs if min(began, hour) <= _at(run) <= end]
         shift = [run for run in runs if _at(run) >= began]
         causes = Counter(run.code for run in shift if run.state is not RunState.PASS)
         judged = _units(run for run in shift if run.state in (RunState.PASS, RunState.FAIL))

@@ -42,6 +42,7 @@ from flasher.station.records.capability import VALUES_MIN
 from flasher.station.records.errors import NotFoundError, RecordError, UnprovenError
 from flasher.station.records.keys import KeyLocations
 from flasher.station.records.model import (
+    CLOCK_TOLERANCE,
     TORN_TRACE,
     TRACE,
     AttachmentFile,
@@ -328,6 +329,9 @@ class SupervisorPages:
         chosen = filter_of(question)
         # The newest run of the filter is the last of any period, or the period has none.
         last = None if chosen.until else self.overview.last_begin(replace(chosen, since=None))
+        latest = self.now() + CLOCK_TOLERANCE
+        if last is not None and last > latest:  # of a clock that was ahead
+            last = self.overview.last_begin(replace(chosen, since=None, until=latest)) or last
         if last is not None and chosen.since is not None and last < chosen.since:
             last = None
         end = chosen.until or last or self.now()

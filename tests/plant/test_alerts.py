@@ -180,3 +180,28 @@ def test_yield_and_last_runs_are_those_of_each_station(plant: Plant, sender: Sen
     checks = {each.kind: each.state for each in two.checks}
     assert checks[CheckKind.YIELD] is UNKNOWN
     assert checks[CheckKind.UNSENT] is OK
+
+
+def test_runs_of_a_clock_that_was_a_year_ahead_hide_no_recent_ones(
+    plant: Plant, sender: Sender
+) -> None:
+    bench = sender.bench
+    right = bench.clock.now
+    bench.clock.now += timedelta(days=365)
+    for number in range(3):
+        bench.make(serial=f"W260501{number}")
+    bench.clock.now = right
+    bench.store.release_clock("jo", "it was a year ahead")
+    for number in range(3):
+        bench.make(RunState.FAIL, f"W260500{number + 2}")
+    sender.send()
+    with (
+        in_zone("UTC"),
+        closing(Central(plant.url(READER))) as central,
+        central.reading() as connection,
+    ):
+        found = activities(connection, [time(6), time(14)], NOW, 3)["line-2"]
+    assert (found.shift, found.day) == (Units(3, 0), Units(3, 0))
+    assert found.last_run is not None
+    assert found.last_run.serial == "W2605004"
+    assert state_of(CheckKind.REPEATED, activity=found) is ALERT

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from html import unescape
 from pathlib import Path
@@ -258,3 +259,22 @@ def test_capability_is_computed_as_at_the_station(plant: Plant, sender: Sender) 
         assert f"{own[0].ppk:.2f}" in shown
         assert "from 7 to 14 V" in shown
         assert "fewer than 30 values" in shown
+
+
+def test_figures_are_not_those_of_a_clock_that_was_a_year_ahead(
+    plant: Plant, sender: Sender
+) -> None:
+    bench = sender.bench
+    right = bench.clock.now
+    bench.clock.now += timedelta(days=365)
+    bench.make(serial="W2605003")
+    bench.clock.now = right
+    bench.store.release_clock("jo", "it was a year ahead")
+    bench.make()
+    bench.make(serial="W2605004")
+    sender.send()
+    with plant.pages() as made:
+        at = replace(made, now=lambda: LATER)
+        assert at._figured(Question("/yield", {}))[1].end < LATER
+        all_ahead = replace(made, now=lambda: LATER - timedelta(days=365))
+        assert all_ahead._figured(Question("/yield", {}))[1].end > LATER

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -221,6 +221,27 @@ def test_what_arrives_late_goes_to_another_file_of_the_month(plant: Plant, sende
     (second,) = retired(plant, "2026-06")
     assert second.file == first.file.replace(".tar.gz", "-2.tar.gz")
     assert examined(plant, plant.folder / "archive").problems == ()
+
+
+def test_what_follows_a_later_month_is_not_due_before_that_is(plant: Plant, sender: Sender) -> None:
+    bench = sender.bench
+    bench.make()
+    right = bench.clock.now
+    bench.clock.now += timedelta(days=365)
+    bench.make(serial="W2605003")
+    bench.clock.now = right
+    bench.store.release_clock("jo", "it was a year ahead")
+    bench.make(serial="W2605004")
+    bench.clock.go_on(MONTH_S)
+    bench.make(serial="W2605005")
+    sender.send()
+    with retirement(plant) as made:
+        due = made.months("2026-06")
+    assert [(each.month, each.rows, each.runs) for each in due] == [("2026-05", 4, 1)]
+    assert [(each.rows, each.runs) for each in retired(plant, "2026-06")] == [(4, 1)]
+    with retirement(plant) as made:
+        assert made.months("2026-06") == []
+    assert retired(plant, "2026-06") == []
 
 
 class KilledError(BaseException):

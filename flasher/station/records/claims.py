@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, replace
 from datetime import datetime, timedelta
 from pathlib import PurePath
-from typing import Any, Final, NoReturn
+from typing import Any, NoReturn
 
 from sqlalchemy import func, select
 
@@ -24,6 +24,7 @@ from flasher.station.records.errors import ClaimRefusedError, Refusal
 from flasher.station.records.model import (
     CHECKED,
     CLOCK_OFFSET,
+    CLOCK_TOLERANCE,
     DUPLICATES,
     PLANT_ANSWER,
     PLANT_CLAIM,
@@ -46,9 +47,6 @@ from flasher.station.records.model import (
 from flasher.station.records.rows import find_or_insert, insert
 from flasher.station.records.schema import recipe, run, socket, station, unit
 from flasher.station.shift_counts import shift_began
-
-CLOCK_TOLERANCE: Final = timedelta(minutes=5)
-"""Network time may set the clock back this far."""
 
 
 def check_order(order: Order, loaded: LoadedRecipe, now: datetime) -> Order:
@@ -413,6 +411,8 @@ class Claiming:
                 run.c.kind == RunKind.GOLDEN.value,
                 run.c.is_virtual == order.is_virtual,
                 run.c.state == RunState.PASS.value,
+                # Of a clock that was ahead, it is not known how long ago that was.
+                run.c.ended_at <= utc_text(self._now + CLOCK_TOLERANCE),
                 recipe.c.part == self._part,
             )
         )

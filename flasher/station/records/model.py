@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, date, datetime
+from datetime import UTC, date, datetime, timedelta
 from enum import IntEnum, StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, NewType, Protocol
@@ -18,6 +18,8 @@ RunId = NewType("RunId", int)
 WriteId = NewType("WriteId", int)
 DEFAULT_LOCK_TIMEOUT_S: Final = 5.0
 """Time that a write waits for another program's lock on the database."""
+CLOCK_TOLERANCE: Final = timedelta(minutes=5)
+"""Network time may set the clock back this far."""
 
 
 class StationClock(Protocol):

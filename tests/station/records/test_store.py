@@ -226,6 +226,24 @@ def test_a_golden_unit_has_to_pass_on_each_socket_and_counts_in_no_figure(bench:
     assert (figures.runs, figures.units, figures.passed) == (2, 2, 2)
 
 
+@pytest.mark.slow
+def test_a_golden_unit_that_passed_while_the_clock_was_ahead_counts_for_no_later_unit(
+    bench: Bench,
+) -> None:
+    bench.use(USUAL + GOLDEN)
+    right = bench.clock.now
+    bench.clock.now += timedelta(days=365)
+    bench.make(RunState.PASS, "W2600001")
+    bench.clock.now = right
+    bench.store.release_clock("jo", "it was a year ahead")
+    assert refusal(bench) is Refusal.GOLDEN_DUE
+    bench.make(RunState.PASS, "W2600001")
+    bench.clock.go_on(-60)  # network time
+    bench.make()
+    bench.clock.go_on(9 * 3600)
+    assert refusal(bench, "W2605003") is Refusal.GOLDEN_DUE
+
+
 def test_wrong_scans_and_a_changed_recipe_begin_nothing(bench: Bench) -> None:
     for scan in ("", "W1", "' OR 1=1 --", "W2605002\n", "\u0000", "x" * 5000):
         assert refusal(bench, scan) is Refusal.WRONG_SERIAL
@@ -289,6 +307,16 @@ def test_a_golden_unit_counts_in_no_figure_of_a_shift(bench: Bench) -> None:
     counts.add(replace(run, kind=RunKind.GOLDEN))
     now = bench.clock.utc().astimezone()
     assert counts.output(now) == ShiftCounts().output(now)
+
+
+def test_runs_that_are_later_than_the_clock_count_in_no_shift(bench: Bench) -> None:
+    run = bench.store.read.run(bench.make()).run
+    counts = ShiftCounts()
+    now = bench.clock.utc().astimezone()
+    counts.add(replace(run, serial="W2605003", ended_at=now + timedelta(days=365)))
+    assert counts.output(now) == ShiftCounts().output(now)
+    counts.add(replace(run, ended_at=now + timedelta(minutes=5)))  # the clock was set back
+    assert counts.output(now).shift == (1, 0)
 
 
 # -- the station dies -----------------------------------------------------------------------------
