@@ -119,8 +119,17 @@ class Connection:
     """Bit rate of the bus and its source; None if unknown."""
     channel: str = ""
     """Channel of the adapter as in python-can; may be empty."""
-    _turn: Lock = field(default_factory=Lock, init=False, repr=False, compare=False)
+    _turn: Lock = field(default_factory=Lock, repr=False, compare=False)
     """Held during a call: two at once would take each other's frames."""
+
+    def renamed(self) -> Connection:
+        """Return the connection with the name that its adapter came back with, after it was lost:
+        another adapter may have the old one.
+        """
+        channel = getattr(self.link, "channel", self.channel)
+        if channel == self.channel:
+            return self
+        return replace(self, name=str(self.link), channel=channel)
 
     def device(
         self,

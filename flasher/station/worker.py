@@ -315,6 +315,7 @@ class Worker:
 
     def _run(self, claim: Claim) -> None:
         recorder: Recorder | None = None
+        self._connection = self._connection.renamed()
         try:
             with Recorder(claim.trace) as recorder:
                 recorder.channel = self._connection.channel

@@ -28,6 +28,7 @@ from flasher.protocol.spec import BMS, OBC, TARGETS, WELLING, WMC, Target
 from flasher.protocol.text import encode_text
 from flasher.release import verify
 from tests.cli.conftest import Flasher, Run
+from tests.cli.test_rescue import Renamed
 from tests.end_to_end.stage import NEW, NEWER, OLD, image_of, packet_number
 from tests.loops import each
 
@@ -144,6 +145,20 @@ def test_the_history_records_each_device_with_the_command_of_the_bike(
     assert [flash.began.target for flash in flashes] == ["obc", "wmc", "bms"]
     assert all(flash.ended and flash.ended.completed for flash in flashes)
     assert all(" --bike " in flash.began.again for flash in flashes)
+
+
+def test_the_history_names_the_adapter_as_it_came_back_for_the_next_devices_too(
+    bike: BikeOnTheBus, upgrade: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An upgrade of them that is interrupted is found by that name."""
+    link = Renamed(bike.bus, 10)
+    monkeypatch.setattr(bike.bus, "link", lambda: link)
+    bike.at[OBC, 2] = lambda: bike.bus.unplug(1.0)
+    run = upgrade("-c", "can2")
+    assert run.code == ExitCode.OK, run.err
+    flashes, _ = FlashHistory().flashes()
+    assert [flash.began.adapter for flash in flashes] == ["virtual can3"] * 3
+    assert all("-c can3" in flash.began.again for flash in flashes)
 
 
 @pytest.mark.slow

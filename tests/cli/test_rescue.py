@@ -111,12 +111,27 @@ def test_the_command_that_repairs_names_the_adapter_as_it_came_back(
     assert "-c can3" in flash.began.again
 
 
+def test_an_adapter_that_gets_its_first_name_back_is_named_by_it(
+    flasher: Flasher, stage: Stage, tmp_path: Path
+) -> None:
+    stage.wrap = lambda link: Renamed(link._bus, link._queue_frames)
+    stage.at_packet[2] = stage.at_packet[3] = lambda: stage.bus.unplug(1.0)
+    stage.at_packet[4] = stage.cut_power
+    image = tmp_path / "new.bin"
+    image.write_bytes(IMAGE.data)
+    failed = flasher("flash", image, "-t", "bms", "-i", "virtual", "-c", "can2")
+    repair = repair_named_in(failed.err)
+    assert repair[repair.index("-c") + 1] == "can2"
+    (flash,) = FlashHistory().flashes()[0]
+    assert flash.began.adapter == "virtual can2"
+
+
 class Renamed(SimulatedLink):
     channel = ""
 
     def reopen(self) -> None:
         super().reopen()
-        self.channel = "can3"
+        self.channel = "can2" if self.channel == "can3" else "can3"
 
     def __str__(self) -> str:
         return f"virtual {self.channel}"

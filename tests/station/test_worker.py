@@ -21,14 +21,14 @@ import pytest
 from flasher.api import Connection
 from flasher.bus.detect import DetectedAdapter
 from flasher.bus.link import VirtualClock
-from flasher.bus.simulated import SimulatedBus
+from flasher.bus.simulated import SimulatedBus, SimulatedLink
 from flasher.errors import BusError, UsageError
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import WELLING
 from flasher.station.config import MockUnits, SocketConfig
-from flasher.station.events import StepStarted
+from flasher.station.events import StepEnded, StepStarted
 from flasher.station.messages import (
     AdapterDown,
     AdapterReady,
@@ -46,7 +46,15 @@ from flasher.station.messages import (
     packed,
 )
 from flasher.station.presence import SILENCE_S
-from flasher.station.records.model import Claim, RunId, RunKind, RunResult, RunState, WriteId
+from flasher.station.records.model import (
+    Claim,
+    RunId,
+    RunKind,
+    RunResult,
+    RunState,
+    StepName,
+    WriteId,
+)
 from flasher.station.unit_run import UnitRun
 from flasher.station.unit_steps import UnitSteps
 from flasher.station.virtual_units import Health, VirtualSocket, make_device
@@ -462,6 +470,28 @@ class RealSocket(Socket):
         Worker(self.setup, self.recipe, self.line, connection).work()
         ended: RunResult = self.channel.of(RunResult)[-1]
         return ended
+
+
+class Renamed(SimulatedLink):
+    channel = "can2"
+
+    def reopen(self) -> None:
+        super().reopen()
+        self.channel = "can3"
+
+    def __str__(self) -> str:
+        return f"socketcan {self.channel}"
+
+
+def test_the_records_name_the_adapter_as_it_came_back(tmp_path: Path) -> None:
+    """The old name may be the adapter of another socket."""
+    socket = RealSocket(tmp_path)
+    link = Renamed(socket.bus, 10)
+    link.reopen()
+    connection = Connection(link, socket.clock, "socketcan can2", channel="can2")
+    Worker(socket.setup, socket.recipe, socket.line, connection).work()
+    steps = [ask.what for ask in socket.channel.of(Ask) if isinstance(ask.what, StepEnded)]
+    assert next(each.text for each in steps if each.step is StepName.CONNECT) == "socketcan can3"
 
 
 class Pulled(RealSocket):

@@ -80,6 +80,7 @@ class UpgradeRun:
     """Start as the history has it."""
     _serial_number: str | None = None
     _result: Result | None = None
+    _connection: Connection = field(init=False)
     _saved: SavedSettings | None = None
 
     def write_planned(
@@ -104,7 +105,9 @@ class UpgradeRun:
             record.facts["waived"] = self.job.waived
             record.facts["image_sha256"] = plan.image.sha256
             try:
-                with connect() as connection:
+                with connect() as opened:
+                    # An earlier upgrade may have lost the adapter.
+                    connection = self._connection = opened.renamed()
                     record.opened(connection)
                     began_at = connection.clock.now()
                     left = self._left_open(connection.name)
@@ -121,7 +124,7 @@ class UpgradeRun:
                                 case PacketAcknowledged(number):
                                     self._reached(Phase.TRANSFER, number)
                                 case AdapterBack():
-                                    self._name_adapter(connection)
+                                    self._name_adapter()
                                 case CheckMade():
                                     self.checks.append(event)
                                     record.facts["checks"] = self.checks
@@ -179,22 +182,21 @@ class UpgradeRun:
             compare_settings(device, self._saved, on_event, **calls)
         return result
 
-    def _name_adapter(self, connection: Connection) -> None:
-        """Give history and commands the name that the adapter came back with: another adapter may
-        have the old one.
-        """
-        channel = getattr(connection.link, "channel", connection.channel)
-        if channel == connection.channel:
+    def _name_adapter(self) -> None:
+        """Give history and commands the name that the adapter came back with."""
+        connection = self._connection.renamed()
+        if connection is self._connection:
             return
-        self.output.progress(f"it is {printable(str(connection.link))} now")
+        self._connection = connection
+        self.output.progress(f"it is {printable(connection.name)} now")
         ctx = click.get_current_context(silent=True)
         if ctx is not None:  # there is none on the page
-            retype(ctx, "channel", channel)
+            retype(ctx, "channel", connection.channel)
             retype(ctx, "interface", self.bus.interface or "")
         if self._start is not None:
             self._start = replace(
                 self._start,
-                adapter=printable(str(connection.link)),
+                adapter=printable(connection.name),
                 again=printable(self.again()),
             )
             self._write_start(self._start)
