@@ -92,7 +92,7 @@ def test_pass_is_on_disk_before_it_is_shown(line: LineBench, bench: Bench) -> No
     def look(event: object) -> None:
         shows = isinstance(event, SocketChanged) and event.state is SocketState.PASS
         if shows or isinstance(event, RunEnded):
-            with sqlite3.connect(bench.path) as other:
+            with bench.outsider() as other:
                 found.extend(row[0] for row in other.execute("SELECT state FROM run"))
 
     line.station._on_event = look
@@ -412,7 +412,7 @@ def test_a_socket_out_of_service_is_that(line: LineBench) -> None:
 def test_what_a_person_does_is_audited(line: LineBench, bench: Bench) -> None:
     for text in ("OPERATOR Kim", "REASON reworked", "HELLO"):
         line.scan(text)
-    with sqlite3.connect(bench.path) as other:
+    with bench.outsider() as other:
         rows = other.execute("SELECT event, data FROM audit ORDER BY id").fetchall()
     events = [row[0] for row in rows]
     assert events[-3:] == ["operator", "reason", "refused scan"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import weakref
 from pathlib import Path
 
 from starlette.routing import BaseRoute
@@ -26,9 +27,12 @@ _KEY = "of the test"
 
 
 def app_of(database: Path, keys: Path) -> ASGIApp:
-    """The pages of the records in a file."""
+    """The pages of the records in a file, which is open as long as they are used."""
     folder = database.with_name(f"{database.name}.files")
-    return app_with(open_supervisor(str(database), folder, KeyLocations(keys), DEFAULT_SHIFTS))
+    supervisor = open_supervisor(str(database), folder, KeyLocations(keys), DEFAULT_SHIFTS)
+    app = app_with(supervisor)
+    weakref.finalize(app, supervisor.store.close)
+    return app
 
 
 def app_with(

@@ -248,6 +248,7 @@ def test_a_share_that_is_not_mounted_is_not_begun_anew(tmp_path: Path) -> None:
     assert copying.wait()
     assert "another share may be mounted" in copying.fault
     assert not list(share.iterdir())
+    bench.store.close()
 
 
 def test_a_share_that_is_unmounted_meanwhile_is_not_begun_anew(tmp_path: Path) -> None:
@@ -270,6 +271,7 @@ def test_a_share_that_is_unmounted_meanwhile_is_not_begun_anew(tmp_path: Path) -
     (kept,) = (mounted / "heads").glob("*.heads")
     numbers = [json.loads(line)["number"] for line in kept.read_text("ascii").splitlines()]
     assert numbers == list(range(1, 9))
+    bench.store.close()
 
 
 def test_a_place_that_was_never_reached_is_begun_when_it_can_be(tmp_path: Path) -> None:
