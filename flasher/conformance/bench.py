@@ -205,6 +205,9 @@ class Bench:
             self.update_tries = tries
             sent = self.send(self.encoder.update(size_bytes))
             reply = self.await_request(sent)
+            if reply is None:  # it may be deaf between two bursts (R14)
+                left_s = sent.left_at + self.limit("first_version_s") - self.now
+                reply = self.wait_for(Reply.BOOT_VERSION, within_s=left_s)
             if reply is None:
                 break
             if reply.kind is Reply.REQUEST:

@@ -19,6 +19,8 @@ from flasher.conformance.dut import Facts
 from flasher.conformance.dut.device import CompiledDevice
 from flasher.conformance.dut.pipes import ABI, FACTS, HEADER, PipeMessage
 from flasher.conformance.dut.subject import open_subject
+from flasher.conformance.explore import Explorer
+from flasher.conformance.profile import ConformanceProfile, Value
 from flasher.conformance.results import CaseVerdict, RunReport
 from flasher.conformance.runner import run
 from flasher.conformance.subject import FlashCall, FlashEffect
@@ -145,6 +147,28 @@ def test_time_passes_for_one_that_polls_the_clock() -> None:
 def test_what_a_chip_does_not_allow_is_a_finding(flaw: str, case_id: str, found: str) -> None:
     report = _run(_FLAWS + flaw, case_id)
     assert found in _failures(report) + report.not_upgradable + report.stopped
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("case_id", "given"),
+    [("PW-01", {}), ("RS-03", {"limits.erase_s": 0.5, "limits.start_s": 1.0})],
+)
+def test_a_device_may_be_deaf_between_its_bursts(case_id: str, given: dict[str, Value]) -> None:
+    kind = _FLAWS + "ListensAfterItsBurst"
+    with open_subject(kind, "bms", None, good_image=None, second_image=None) as (device, profile):
+        judged_by = ConformanceProfile({**profile.given, **given})
+        report = run(device, judged_by, selection=Selection((case_id,)))
+    assert not _failures(report)
+    assert report.ok
+
+
+def test_half_a_message_before_a_power_cut_spoils_one_of_the_restart() -> None:
+    kind = _FLAWS + "AnswersByFeedbackToo"
+    with open_subject(kind, "bms", None, good_image=None, second_image=None) as (device, profile):
+        steps = ["reset", "update=good", "packets=all", "cut=0"]
+        explored = Explorer(device, profile).replay(steps)
+    assert explored.finding is None
 
 
 @pytest.mark.slow

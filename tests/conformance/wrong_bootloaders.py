@@ -118,6 +118,48 @@ class RecordsBeforeTheLastPacket(PythonBootloader):
         return self.host.flash_read(0, 4) == struct.pack("<I", 0x600DC0DE)
 
 
+class ListensAfterItsBurst(PythonBootloader):
+    """Is right: takes an update command only just after a burst, and makes a pause of 3 s
+    between bursts without an application.
+    """
+
+    _listens_until = 0
+
+    def _act(self, mode: int, command: bytes, data: bytes) -> None:
+        if command != b"\xa1\x0b" or self._stored >= 0 or self._now < self._listens_until:
+            super()._act(mode, command, data)
+
+    def tick(self, now_us: int) -> int | None:
+        is_due = now_us >= self._due_at and self._stored < 0 and not self._is_starting
+        if is_due and self._announced == 4 and not self._is_whole():
+            self._announced, self._due_at = 0, now_us + 3_000_000
+        before = self._announced
+        due_us = super().tick(now_us)
+        if (before, self._announced) == (3, 4):
+            self._listens_until = now_us + 200_000
+        return due_us
+
+
+class AnswersByFeedbackToo(PythonBootloader):
+    """Is right: sends general feedback (R15), and ends a transfer a bit later."""
+
+    _ends_at = -1
+
+    def _act(self, mode: int, command: bytes, data: bytes) -> None:
+        if mode == 0x16:
+            self._send(b"\x55\x03", b"ACK")
+        super()._act(mode, command, data)
+
+    def _end(self) -> None:
+        self._ends_at = self._now + 200
+
+    def tick(self, now_us: int) -> int | None:
+        if 0 <= self._ends_at <= now_us:
+            self._ends_at = -1
+            super()._end()
+        return now_us + 100 if self._ends_at >= 0 else super().tick(now_us)
+
+
 class WaitsForTheClock(PythonBootloader):
     """Polls the time, as code without timers does."""
 

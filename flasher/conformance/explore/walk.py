@@ -116,6 +116,7 @@ class Walk:
         self._may_complete = False
         self._may_send_partial = False
         """A message of the device may have been cut off, so half of it may arrive next."""
+        self._spoilt_until = -inf
         self._nodes_asked: frozenset[int] = frozenset()
         """Ids on which the device may answer other nodes whose messages the walk imitated."""
         self._requested_at = -inf
@@ -249,10 +250,19 @@ class Walk:
                     )
             case Reply.OTHER if reply.can_id in self._nodes_asked:
                 pass
-            case Reply.DAMAGED if self._may_send_partial:
-                self._may_send_partial = False
+            case Reply.DAMAGED if self._is_spoilt(reply):
+                pass
             case Reply.OTHER | Reply.DAMAGED:
                 raise Violation("form", f"{reply}: not a message of a device")
+
+    def _is_spoilt(self, reply: Received) -> bool:
+        """True for half a message, and for the rest of the next one, whose beginning was taken for
+        its end.
+        """
+        if self._may_send_partial:
+            self._may_send_partial = False
+            self._spoilt_until = reply.at + self.bench.limit("inter_frame_s")
+        return reply.at < self._spoilt_until
 
     def _judge_number(self, reply: Received) -> None:
         if reply.kind is Reply.ACK:
