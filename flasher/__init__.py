@@ -42,7 +42,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from flasher import events
+    from flasher import errors, events
     from flasher.api import (
         AsyncDevice,
         Connection,
@@ -97,26 +97,33 @@ __all__ = [
     "Verification",
     "WriteResult",
     "contents",
+    "errors",
     "events",
 ]
 
 
-_MODULES = {"contents": "flasher.protocol.contents", "events": "flasher.events"}
+_MODULES = {
+    "contents": "flasher.protocol.contents",
+    "errors": "flasher.errors",
+    "events": "flasher.events",
+}
 
 
-def __getattr__(name: str) -> Any:
-    """Load a name when it is first used: a process that needs a part of the package starts in a
-    third of the time.
-    """
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    if name in _MODULES:
-        value = import_module(_MODULES[name])
-    else:
-        is_error = name in {"ExitCode", "FlasherError"}
-        value = getattr(import_module("flasher.errors" if is_error else "flasher.api"), name)
-    globals()[name] = value
-    return value
+if not TYPE_CHECKING:  # else every misspelled name would have the type Any
+
+    def __getattr__(name: str) -> Any:
+        """Load a name when it is first used: a process that needs a part of the package starts in a
+        third of the time.
+        """
+        if name not in __all__:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        if name in _MODULES:
+            value = import_module(_MODULES[name])
+        else:
+            is_error = name in {"ExitCode", "FlasherError"}
+            value = getattr(import_module("flasher.errors" if is_error else "flasher.api"), name)
+        globals()[name] = value
+        return value
 
 
 def __dir__() -> list[str]:

@@ -147,7 +147,7 @@ class DeviceInfo:
     @property
     def no_faults(self) -> str:
         """Text for no received faults; only one document gives their interval."""
-        is_periodic = self.dialect is WELLING
+        is_periodic = self.dialect == WELLING
         proviso = "" if is_periodic else "; how often they are sent is not documented: see monitor"
         return f"none received{proviso}"
 
@@ -404,7 +404,7 @@ class Procedures:
     def plan(self, image: Image | Plan) -> Plan:
         """Plan an upgrade with this image."""
         if isinstance(image, Plan):
-            if image.target is not self.target:
+            if image.target != self.target:
                 planned, own = image.target.node.name, self.target.node.name
                 raise UsageError(f"The plan is for a {planned}, and this device is a {own}.")
             return image

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import random
 from collections.abc import Callable
@@ -94,6 +95,12 @@ def test_verifying_can_be_cancelled() -> None:
 def test_a_plan_for_another_target_is_refused() -> None:
     with pytest.raises(UsageError, match="The plan is for a BMS, and this device is a WMC"):
         wire_to().device("wmc").upgrade(flasher.make_plan(IMAGE, "bms"))
+
+
+def test_a_plan_that_was_copied_or_came_from_another_process_is_that_of_the_device() -> None:
+    plan = copy.deepcopy(flasher.make_plan(IMAGE, "bms"))
+    with flasher.connect_mock("bms", speed=0) as connection:
+        assert connection.device("bms").upgrade(plan).ok
 
 
 def test_a_device_without_an_application_is_rescued() -> None:

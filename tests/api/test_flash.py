@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import random
 import re
+import subprocess
+import sys
 import textwrap
 import time
 import uuid
@@ -494,6 +496,13 @@ def test_the_examples_of_the_tour_run(
 
 def test_everything_that_the_tour_exports_is_there() -> None:
     assert [name for name in flasher.__all__ if not hasattr(flasher, name)] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["contents", "errors", "events"])
+def test_its_modules_are_there_before_anything_was_called(name: str) -> None:
+    program = f"import flasher; flasher.{name}"
+    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 # -- the battery's own data -----------------------------------------------------------------------
