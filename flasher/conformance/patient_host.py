@@ -127,10 +127,16 @@ class PatientHost:
                     announced_at = reply.at
                     tester.wait_until(announced_at + start_s)
                     continue
+                # A bootloader may send general feedback, too (R15): it does not restart, or goes on
+                # announcing itself.
+                if reply is None and not is_last:
+                    continue
+                runs = runs and reply is not None
                 if reply is not None:
                     after_s = limit("start_s") if runs else _SETTLE_S
-                    tester.wait(tester.waits.burst_s + after_s)
-                    tester.forget()
+                    later = tester.collect(tester.waits.burst_s + after_s)
+                    ends_at = reply.at + tester.waits.burst_s
+                    runs = runs and all(one.at < ends_at for one in later)
                 tester.expired = {} if runs else limits_of(limit_s)
                 return runs
             # The reset may have started a burst, which another reset would restart.

@@ -84,3 +84,11 @@ def test_a_repeated_update_command_names_how_often_it_is_answered(
     assert check.expected == f"request transfer {expected}"
     assert check.got == "once"
     assert (check.outcome is CheckOutcome.PASS) == is_right
+
+
+def test_a_burst_that_is_too_long_names_how_many_boot_versions_were_expected() -> None:
+    profile = ConformanceProfile({**profile_of_mock().given, "device.versions": 3})
+    report = run(MockSubject("bms"), profile, selection=Selection(("RS-01",)))
+    failure = report.results[0].first_failure
+    assert failure is not None
+    assert failure.expected == "0 more boot versions (a burst has 3)"

@@ -18,12 +18,15 @@ from flasher.conformance.mock import MOCK_PROFILE, model_image, profile_of_mock
 from flasher.conformance.profile import ConformanceProfile, Value
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
+from flasher.conformance.wire import WRITE
 from flasher.mock.memory import Operation
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.variants.ending import RecordErasedLast
 from flasher.mock.variants.entering import AnyTargetName, ErasesBeforeCheck
 from flasher.mock.variants.framing import PaddingFatal
+from flasher.protocol import messages
+from flasher.protocol.wire import Message
 from tests.campaigns.dual_bank import (
     CopiesImage,
     CopyingStore,
@@ -89,6 +92,27 @@ def test_a_request_for_a_doubled_update_command_may_come_between_two_copies_of_p
 
 def test_a_seed_makes_the_same_device_again() -> None:
     assert str(right_device(5)) == str(right_device(5)) != str(right_device(6))
+
+
+class AlsoSendsFeedback(MockDevice):
+    """Its bootloader sends general feedback to every write, too (R15)."""
+
+    def _take_message(self, message: Message, now: float) -> None:
+        if not self._runs_application and message.mode == WRITE:
+            self._send(messages.GeneralFeedbackMessage())
+        super()._take_message(message, now)
+
+
+@pytest.mark.slow
+def test_general_feedback_to_a_reset_is_no_application_where_a_bootloader_sends_it() -> None:
+    waits = dataclasses.replace(MOCK_PROFILE, pause_in_transfer="waits")
+    stated = profile_of_mock(waits).given
+    profile = ConformanceProfile(
+        {**stated, **dict.fromkeys(("rs_02", "rs_03_old", "tx_12", "fr_10"), "either")}
+    )
+    made = subject(AlsoSendsFeedback, waits, target="wmc")
+    report = run(made, profile, selection=Selection(cases=("RS-03", "TX-12")))
+    assert [result.verdict for result in report.results] == [CaseVerdict.PASS] * 2
 
 
 # -- times at their limits -------------------------------------------------------------------------

@@ -163,6 +163,13 @@ def test_a_device_may_be_deaf_between_its_bursts(case_id: str, given: dict[str, 
     assert report.ok
 
 
+@pytest.mark.slow
+def test_flash_operations_that_only_some_upgrades_have_are_not_tried_among_many() -> None:
+    (result,) = _run(_FLAWS + "WritesALog", "PW-01").results
+    assert result.verdict is CaseVerdict.PASS_IN_PART
+    assert "an upgrade has more than 24 flash operations" in result.reason
+
+
 def test_half_a_message_before_a_power_cut_spoils_one_of_the_restart() -> None:
     kind = _FLAWS + "AnswersByFeedbackToo"
     with open_subject(kind, "bms", None, good_image=None, second_image=None) as (device, profile):

@@ -91,15 +91,17 @@ class StartsWhatIsTorn(PythonBootloader):
         return self.host.flash_read(0, 8) == bytes(8)
 
 
-class RecordsBeforeTheLastPacket(PythonBootloader):
-    """Has many flash operations before end of transfer, and trusts a record that it writes before
-    the last packet.
-    """
+class WritesALog(PythonBootloader):
+    """Is right: has many flash operations before end of transfer."""
 
     def _begin(self, size: int) -> None:
         super()._begin(size)
         for at in range(0x100, 0x200, 8):
             self.host.flash_write(at, bytes(8))
+
+
+class RecordsBeforeTheLastPacket(WritesALog):
+    """Trusts a record that it writes before the last packet."""
 
     def _store(self, data: bytes) -> None:
         if self._stored + 1 < -(-self._size // 128):

@@ -510,6 +510,9 @@ def _cut_start(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
         if upgrade.old != bench.good_image:  # else a device with two banks may go back to it
             bench.check_upgrade()
         _cut_rare_operations(bench, bench.good_image, upgrade.operations, more)
+    else:
+        what = "power cuts in flash operations that only some upgrades have"
+        bench.unsupported(what, f"an upgrade has more than {_OPERATIONS_MAX} flash operations")
 
 
 def _cut_rare_operations(bench: Bench, image: bytes, before: int, more: int) -> None:
