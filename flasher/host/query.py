@@ -137,7 +137,10 @@ def ask(run: Runner[Any], query: Query) -> Stage[Query]:
                 query.cancelled = query.answer is None
                 break
             case Signal.TIME if run.now >= query.ends_at:
-                break
+                if query.copies_sent or run.now >= run.tx.due_at:
+                    break
+                # This computer paused in the first copy, which is about to be sent again.
+                query.ends_at = run.now + run.timings.command_timeout_s
             case Signal.TIME if run.now >= query.repeat_at:
                 query.repeat_at = inf  # it starts when the message was sent
                 query.tries += 1

@@ -19,6 +19,7 @@ from flasher.host.identify import LISTEN_FIRST_S
 from flasher.host.query import check_range
 from flasher.host.write import plan_write
 from flasher.protocol import contents
+from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, MOTINOVA, OBC, WELLING, WMC, Dialect, Node, Target
 from tests.api.battery import ANSWERS, Battery, wire_to
 from tests.loops import each
@@ -52,6 +53,23 @@ def test_a_silent_device_is_no_answer_with_what_was_asked() -> None:
         wire.device().read("history")
     assert "752 3800, sent 5 times" in caught.value.where
     assert 1.0 + LISTEN_FIRST_S <= wire.clock.now() < 1.2
+
+
+def test_a_pause_of_this_computer_in_the_first_message_is_no_silence_of_the_device(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    battery = Battery()
+    connection = wire_to(battery)
+    send, pauses_s = connection.link.send, [1.2]
+
+    def pause(frame: Frame) -> None:
+        send(frame)
+        if pauses_s:
+            connection.clock.wait_until(connection.clock.now() + pauses_s.pop())
+
+    monkeypatch.setattr(connection.link, "send", pause)
+    assert connection.device().read("production-information")
+    assert battery.received == [(0x3700, b"")]
 
 
 def test_an_answer_in_another_form_is_named_as_the_cause() -> None:

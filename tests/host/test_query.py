@@ -180,6 +180,19 @@ def test_a_message_that_is_half_sent_at_the_end_is_finished_first() -> None:
     assert bench.over()
 
 
+def test_a_first_copy_in_which_this_computer_paused_is_sent_again_and_may_be_answered() -> None:
+    bench = ask()
+    bench.engine.tick(0.0)
+    assert bench.engine.next_frame(0.0) is not None
+    bench.now = 0.95
+    bench.engine.frame_sent(bench.now)
+    bench.run(1.5)
+    assert not bench.over()
+    assert bench.query.tries == 2
+    bench.say(0x720, 0x0C, 0x1540, VERSION)
+    assert isinstance(bench.query.answer, contents.VersionInformation)
+
+
 def test_a_bus_that_never_takes_the_second_half_does_not_hold_it_up_for_ever() -> None:
     bench = ask()
     bench.engine.tick(0.0)
