@@ -254,6 +254,8 @@ def connect_mock(
 
     chosen, node = as_dialect(dialect), as_target(target)
     bitrate_bps = chosen.bitrate_bps
+    if not speed >= 0:
+        raise UsageError(f"The speed cannot be {speed}: it is 0 or more.")
     own = (profile or DeviceProfile()).speaking(chosen)
     clock: Clock = SteadyClock(speed) if speed else VirtualClock()
     bus = SimulatedBus(bitrate_bps, clock)

@@ -135,6 +135,15 @@ def test_the_mock_takes_the_time_of_a_real_bus_unless_set_otherwise() -> None:
     assert outcome.statistics.transfer_s >= 3 * 0.009
 
 
+@pytest.mark.parametrize("speed", [-1.0, float("nan")])
+def test_a_speed_at_which_time_does_not_pass_is_refused(speed: float) -> None:
+    with (
+        pytest.raises(UsageError, match="it is 0 or more"),
+        flasher.connect_mock("bms", speed=speed),
+    ):
+        pass
+
+
 def test_what_the_device_model_reports_can_be_watched() -> None:
     seen: list[object] = []
     with flasher.connect_mock("bms", speed=0, on_event=seen.append) as connection:
