@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
@@ -234,6 +235,24 @@ def test_a_table_that_is_made_anew_keeps_rules_and_rows(old: Old, planted: Any) 
     assert rules == {name: after.get(name) for name in rules}
     assert before.keys() - after.keys() == {"index ix_run_lot_id"}  # schema 3 has a better one
     assert old.rows()["run"] == runs
+
+
+def test_a_backup_is_read_with_a_copy_of_the_key_alone(old: Old) -> None:
+    folder = old.folder / "copy"
+    (folder / "keys").mkdir(parents=True)
+    shutil.copy(old.url, folder / "copy.sqlite")
+    shutil.copytree(old.files, folder / "records.sqlite.files")
+    for key in old.folder.glob("keys/*.key"):
+        shutil.copy(key, folder / "keys")
+    copy = Old(folder, str(folder / "copy.sqlite"))
+    old.open().close()  # the station goes on, and stores later heads
+    copy.upgrade()
+    with closing(copy.open(read_only=True)) as store:
+        assert not store.examine().problems
+    with closing(old.open()) as station:
+        station.recover()
+        assert not station.examine().problems
+    copy.engine.dispose()
 
 
 def test_a_full_disk_leaves_everything(old: Old, monkeypatch: pytest.MonkeyPatch) -> None:
