@@ -267,7 +267,8 @@ class Claiming:
                 ),
                 remedy=text(
                     "Set the clock of this computer. If the clock is right and that record is"
-                    " not: end the station, then flasher station accept clock."
+                    " not: end the station, then flasher station accept clock"
+                    " --reason TEXT."
                 ),
             )
 

@@ -94,7 +94,8 @@ class SigningKey:
             raise KeyMissingError(
                 "The signing key of the station cannot be used: the file holds no Ed25519 key.",
                 where=shown,
-                remedy="Put the right file back; if it is lost: flasher station key --lost.",
+                remedy="Put the right file back; if it is lost: flasher station key --lost"
+                " --reason TEXT.",
             ) from error
 
     @classmethod

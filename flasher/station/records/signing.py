@@ -80,7 +80,8 @@ class Signer:
                     where=self._database.location.shown,
                     cause=f"audit row {last.number} is stored in {place.shown}",
                     remedy="Put the right records back (flasher station verify names what is"
-                    " missing); if they are lost: flasher station accept restored.",
+                    " missing); if they are lost: flasher station accept restored"
+                    " --reason TEXT.",
                 )
         self._load()
         if not self.copies:
@@ -200,7 +201,7 @@ class Signer:
                     " not there.",
                     where=printable(str(path)),
                     remedy="Put the file back, or name its folder with --keys; if it is lost:"
-                    " flasher station key --lost.",
+                    " flasher station key --lost --reason TEXT.",
                 )
             following.replace(path)
         self._key = loaded

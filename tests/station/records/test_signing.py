@@ -49,7 +49,7 @@ def test_a_key_that_is_gone_stops_the_station_until_a_person_replaces_it(bench: 
     store = reopened(bench)
     with pytest.raises(KeyMissingError, match="is not there") as caught:
         store.recover()
-    assert "flasher station key --lost" in caught.value.remedy
+    assert "flasher station key --lost --reason TEXT" in caught.value.remedy
     store.replace_lost_key("jo", "the disk of the PC died")
     store.recover()
     bench.make(serial=OTHER)
@@ -157,7 +157,7 @@ def test_an_older_copy_does_not_become_the_station_before_a_person_confirms_it(
     bench.store = store = bench.opened()
     with pytest.raises(RecordsCutError) as caught:
         store.recover()
-    assert "flasher station accept restored" in caught.value.remedy
+    assert "flasher station accept restored --reason TEXT" in caught.value.remedy
     assert store.accept_restored("jo", "the disk died, this is the backup of the night") == 2
     with pytest.raises(UsageError, match="Nothing is missing"):
         store.accept_restored("jo", "once more")
@@ -195,7 +195,7 @@ def test_a_clock_earlier_than_the_last_record_begins_no_unit_until_a_person_rele
     with pytest.raises(ClaimRefusedError) as caught:
         bench.claim(OTHER)
     assert caught.value.refusal is Refusal.CLOCK
-    assert "accept clock" in caught.value.remedy
+    assert "accept clock --reason TEXT" in caught.value.remedy
     bench.store.release_clock("jo", "the battery of the clock was empty")
     bench.make(serial=OTHER)
     bench.clock.now -= timedelta(minutes=4)
