@@ -639,8 +639,8 @@ class UpgradeStage:
             self._end(Ending.WRONG_DEVICE, content)
             return
         answer_id = self._plan.target.answer_id
-        if not self._duplicates.application_beside and not self._duplicates.has_announced(
-            answer_id
+        if isinstance(content, GeneralFeedbackMessage) and not (
+            self._duplicates.application_beside or self._duplicates.has_announced(answer_id)
         ):
             # Announcements before the reset have ended: an application is present and restarts.
             self._await_boot(content)

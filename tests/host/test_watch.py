@@ -192,6 +192,22 @@ def test_a_reset_that_leaves_late_is_followed_by_a_whole_watch() -> None:
     assert begins(bench, UpdateCommand) >= left_at + WATCH_S - 1e-6
 
 
+def test_an_announcement_right_after_one_that_waited_for_that_reset_to_be_accepted() -> None:
+    """This computer paused, and read those of the pause just before the next one came."""
+    bench = Bench()
+    bench.engine = Upgrade(plan(bench.image, BMS, WELLING.bitrate_bps))
+    bench.engine._upgrade.announcement = BOOT.to_message(BMS.answer_id)
+    bench.engine.tick(bench.now)
+    for frame in answer_frames(BOOT):
+        bench.engine.receive(frame, bench.now)
+    while bench.engine.next_frame(bench.now) is not None:
+        bench.engine.frame_sent(bench.now)
+    bench.now += 0.0002
+    bench.say(BOOT)
+    bench.sent.clear()
+    bench.expect(UpdateCommand)
+
+
 def test_an_application_that_answers_that_reset_is_waited_for() -> None:
     bench = heard_before()
     bench.expect(ResetCommand)
