@@ -969,7 +969,7 @@ class UpgradeStage:
         self._run.send(split(query.can_id, encode(query)), tag=Command.READ_VERSION)
 
     def _miss_version(self, content: ReceivedContent) -> None:
-        asked_s = self._run.now - self._state_since
+        asked_s = self._tx.left_at - self._state_since
         if asked_s >= self._timings.application_start_timeout_s:
             self._end(Ending.UNCONFIRMED, content)
         else:

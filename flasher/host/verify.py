@@ -292,6 +292,7 @@ def check_version(
     run.also_listen_on(plan.target.answer_id)
     look = _note_boot_versions(run, plan.target, announcing)
     while True:
+        asked_at = run.now
         query = yield from filtered(ask(run, Query(request, quiet=True)), look)
         if query.answer is not None:
             announced = announcing.count
@@ -307,7 +308,7 @@ def check_version(
         if run.now >= max(give_up_at, announcing.judged_at) and announcing.goes_on(run.now):
             return Verification(Level.VERSION, Verdict.IN_BOOTLOADER)
         # One that starts it through its bootloader may need as long again.
-        if run.now >= max(give_up_at, announcing.last_at + start_s):
+        if asked_at >= max(give_up_at, announcing.last_at + start_s):
             return Verification(Level.VERSION, Verdict.NO_ANSWER)
     return _judge_version(run, plan, query.answer, serial_before)
 

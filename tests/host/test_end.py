@@ -241,6 +241,19 @@ def test_no_boot_version_is_answered_after_the_end_and_the_version_answer_decide
     assert sum(isinstance(row, UpdateCommand) for _, row in bench.sent) == 1
 
 
+def test_a_new_application_is_asked_up_to_its_time_limit() -> None:
+    bench = versioned()
+    bench.to_end()
+    bench.say(BOOT)
+    bench.expect(Message)
+    asked_at = bench.sent[-1][0]
+    while bench.now < asked_at + 4.95:
+        bench.expect(Message)
+    answer_version(bench, NEW)
+    assert bench.outcome.ending is Ending.CONFIRMED_BY_VERSION
+    assert asked_at + 4.95 <= bench.sent[-1][0] < asked_at + 5.25
+
+
 def test_boot_versions_after_the_end_and_nothing_more_are_unconfirmed() -> None:
     bench = versioned()
     bench.to_end()

@@ -400,7 +400,27 @@ def test_a_bootloader_that_announces_itself_beyond_a_burst_runs_no_application(
     while application.next_question() is not None:
         pass
     assert check.result.verdict is verdict
-    assert application.now < 50.0 + 12.0
+    assert application.now < 50.0 + 13.0
+
+
+@each("starts_at, is_right", [(54.95, True), (54.99, True), (56.5, False)])
+def test_an_application_may_start_up_to_the_limit(starts_at: float, *, is_right: bool) -> None:
+    check = version_check(planned(), UpgradeOptions())
+    application = Application(check)
+    while application.next_question() is not None:
+        if application.now >= starts_at:
+            application.answer(VERSION, NEW_VERSION)
+    assert (check.result.verdict is Verdict.VERSION_RIGHT) is is_right
+
+
+def test_an_application_is_asked_after_a_pause_of_this_computer_as_long_as_the_limit() -> None:
+    check = version_check(planned(), UpgradeOptions())
+    application = Application(check)
+    application.next_question()
+    application.now += 5.0
+    while application.next_question() is not None:
+        application.answer(VERSION, NEW_VERSION)
+    assert check.result.verdict is Verdict.VERSION_RIGHT
 
 
 def test_an_application_that_starts_after_the_bootloader_announced_itself_late_is_right() -> None:
