@@ -114,6 +114,7 @@ class _Attempt:
     """Time of the last message of the device's application."""
     boot: BootVersion | None = None
     """First boot version of the attempt."""
+    first_reset_left_at: float = inf
     was_reset_again: bool = False
     watched_since: float = 0.0
     watched_until: float = 0.0
@@ -121,6 +122,10 @@ class _Attempt:
     update_began_at: float = inf
     announced_meanwhile: BootVersion | None = None
     """Boot version that came too early for another update command, and after the last one began."""
+    announced_s: float = 0.0
+    """Time in which boot versions went on after the first update command; a silence, in which the
+    device may have erased or this computer paused, counts as short."""
+    announced_at: float = 0.0
     request_at: float = 0.0
 
     packet: int = 0
@@ -461,12 +466,14 @@ class UpgradeStage:
         elif isinstance(tag, Command):
             self._duplicates.upgrade_message_sent(tag, self._run.now, at.packet)
         match tag:
+            case Command.RESET:
+                at.first_reset_left_at = min(at.first_reset_left_at, left_at)
             case Command.PACKET:
                 at.copies_unanswered += 1
             case Command.UPDATE:
                 self._update_left_at = left_at
                 if at.first_update_left_at is None:
-                    at.first_update_left_at = left_at
+                    at.first_update_left_at = at.announced_at = left_at
             case Command.END_OF_TRANSFER:
                 self._whole_transfers += not at.end_copies_left
                 at.end_copies_left += 1
@@ -567,7 +574,7 @@ class UpgradeStage:
     # -- actions: up to the update command --------------------------------------------------------
 
     def _repeat_reset(self, content: ReceivedContent) -> None:
-        if self._run.now - self._state_since >= self._timings.command_timeout_s:
+        if self._run.now - self._at.first_reset_left_at >= self._timings.command_timeout_s:
             self._await_boot(content)
         else:
             self._send_reset()
@@ -660,7 +667,7 @@ class UpgradeStage:
         has_ended = self._run.now < at.watched_until
         if self._duplicates.application_beside and has_ended and not at.was_reset_again:
             # The announcements have ended, and an application is present: reset it.
-            at.was_reset_again = True
+            at.was_reset_again, at.first_reset_left_at = True, inf
             self._enter(UpgradeState.RESETTING)
             self._send_reset()
         else:
@@ -702,6 +709,9 @@ class UpgradeStage:
         elif self._options.at_power_up and self._silent_ending is Ending.NO_BOOT_VERSION:
             self._asks_for_power = True
             self._wait_for_boot()
+        elif self._at.was_reset_again:
+            # A bootloader may have confirmed that reset, and started its application since.
+            self._fail(self._silent_ending, content, Reason.BOOT_GIVEN_UP)
         else:
             self._end(self._silent_ending, content)
 
@@ -716,6 +726,9 @@ class UpgradeStage:
         """Handle a boot version between update command and request transfer (R2)."""
         now, timings, at = self._run.now, self._timings, self._at
         next_at = self._update_left_at + timings.update_spacing_s
+        if self._is_updating:
+            at.announced_s += min(now - at.announced_at, timings.burst_s)
+            at.announced_at = now
         if self._is_foreign(boot):
             self._end(Ending.WRONG_DEVICE, boot)
         elif self.unchecked is not None:
@@ -730,8 +743,7 @@ class UpgradeStage:
             self._send_update_again(boot)
 
     def _send_update_again(self, boot: BootVersion) -> None:
-        first_at, limit_s = self._at.first_update_left_at, self._timings.request_transfer_timeout_s
-        if first_at is not None and self._run.now - first_at > limit_s:
+        if self._at.announced_s > self._timings.request_transfer_timeout_s:
             self._update_ignored(boot)
         else:
             self._note_boot(boot)

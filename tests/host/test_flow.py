@@ -91,6 +91,22 @@ def test_reset_is_repeated_every_200_ms_and_given_up_after_one_second() -> None:
     assert bench.engine.state is UpgradeState.AWAITING_BOOT
 
 
+def test_reset_is_repeated_after_a_pause_of_this_computer_too() -> None:
+    """The device drops a reset whose second frame comes so late (R12)."""
+    bench = Bench()
+    bench.engine = Upgrade(plan(bench.image, BMS, WELLING.bitrate_bps))
+    bench.sent.clear()
+    bench.engine.tick(bench.now)
+    bench.engine.next_frame(bench.now)
+    bench.engine.frame_sent(bench.now)
+    bench.engine.next_frame(bench.now)
+    bench.now += 1.5
+    bench.engine.frame_sent(bench.now)
+    bench.expect(ResetCommand, within_s=0.25)
+    bench.say(GeneralFeedbackMessage(), BOOT)
+    bench.expect(UpdateCommand)
+
+
 def test_reset_stops_at_general_feedback() -> None:
     bench = Bench()
     bench.expect(ResetCommand)
@@ -272,6 +288,23 @@ def test_the_update_command_is_never_repeated_into_silence() -> None:
     error = outcome.error()
     assert error is not None
     assert error.exit_code == ExitCode.NO_ANSWER
+
+
+@each("silence_s", [0.3, 5.0, 9.5])
+def test_a_device_that_announces_itself_after_a_silence_may_have_received_the_command(
+    silence_s: float,
+) -> None:
+    """It erased, or restarted, or this computer paused and the command left after that."""
+    bench = Bench()
+    bench.to_request()
+    bench.wait(9.9)
+    bench.say(BOOT)
+    bench.expect(UpdateCommand)
+    bench.wait(silence_s)
+    bench.say(BOOT)
+    bench.expect(UpdateCommand)
+    bench.say(RequestTransfer())
+    assert bench.expect(Packet).number == 1
 
 
 @each("late_s, in_time", [(-0.001, True), (0.001, False)])

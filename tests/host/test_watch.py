@@ -134,6 +134,23 @@ def test_that_reset_is_repeated_as_ever() -> None:
     bench.expect(ResetCommand, within_s=0.3)
 
 
+@each("attempts", [None, 1])
+def test_a_bootloader_that_confirmed_that_reset_as_well_gets_another_one(
+    attempts: int | None,
+) -> None:
+    """It started its application since, as no update command came in its window."""
+    bench, _ = beside(UpgradeOptions(attempts=attempts))
+    bench.expect(ResetCommand)
+    bench.say(GeneralFeedbackMessage())
+    bench.wait(5.1)
+    if attempts == 1:
+        assert bench.outcome.ending is Ending.NO_BOOT_VERSION
+        return
+    bench.to_boot()
+    bench.say(BOOT)
+    bench.expect(UpdateCommand)
+
+
 def test_it_is_reset_again_once() -> None:
     bench, _ = beside()
     bench.expect(ResetCommand)
