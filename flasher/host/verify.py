@@ -31,7 +31,15 @@ from flasher.host.outcome import (
     ErrorDescription,
     with_device_state,
 )
-from flasher.host.query import READ_MEMORY, Query, ask, count_answers, memory_bytes, memory_requests
+from flasher.host.query import (
+    READ_MEMORY,
+    Query,
+    ask,
+    check_range,
+    count_answers,
+    memory_bytes,
+    memory_requests,
+)
 from flasher.host.runner import Runner, Stage, StageInput, filtered
 from flasher.image.image import AddressSpan
 from flasher.image.plan import Plan
@@ -247,12 +255,15 @@ def check_level(plan: Plan, level: Level, options: UpgradeOptions | None = None)
             cause="the document gives no query for it, and no profile names one",
             remedy="Leave --verify or --level out.",
         )
-    if level is Level.MEMORY and plan.image.base is None:
+    if level is not Level.MEMORY:
+        return
+    if plan.image.base is None:
         raise UsageError(
             "The memory cannot be read back without addresses.",
             cause=f"{plan.image.source} is a raw binary",
             remedy="Give the address of its first byte with --base.",
         )
+    check_range(plan.image.base, plan.image.base + plan.image.size_bytes)
 
 
 def version_check(plan: Plan, options: UpgradeOptions) -> Runner[Verification]:

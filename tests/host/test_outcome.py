@@ -254,6 +254,12 @@ def test_what_can_be_verified_and_what_is_by_default() -> None:
         (BMS, Level.MEMORY, 0x1000, ""),
         (BMS, Level.MEMORY, 0, ""),
         (BMS, Level.MEMORY, None, "The memory cannot be read back without addresses."),
+        (
+            BMS,
+            Level.MEMORY,
+            0xFFFF_FFFE,
+            "0xFFFFFFFE to 0x10000012A is not a valid memory range.",
+        ),
         (WMC, Level.VERSION, None, "A WMC cannot be verified by version."),
         (WMC, Level.NONE, None, ""),
     ],
