@@ -140,6 +140,7 @@ def test_time_passes_for_one_that_polls_the_clock() -> None:
         ("EndsAtOnce", "BR-01", "the bootloader ended with status 3 in flasher_dut_start"),
         ("StartsWhatIsTorn", "PW-01", "an incomplete application"),
         ("RecordsBeforeTheLastPacket", "PW-01", "an incomplete application"),
+        ("CompactsAfterComplete", "PW-01", "in a row: expected application"),
         ("LosesComplete", "EN-01", "expected complete"),
         ("Restarts", "EN-01", "boot version"),
     ],

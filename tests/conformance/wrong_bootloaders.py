@@ -120,6 +120,31 @@ class RecordsBeforeTheLastPacket(WritesALog):
         return self.host.flash_read(0, 4) == struct.pack("<I", 0x600DC0DE)
 
 
+class CompactsAfterComplete(WritesALog):
+    """Has a journal that it writes when complete has left; a full one it erases with the record."""
+
+    facts = dataclasses.replace(PythonBootloader.facts, abi=2)
+    _is_due = False
+
+    def _end(self) -> None:
+        super()._end()
+        self._is_due = self._is_starting
+
+    def tick(self, now_us: int) -> int | None:
+        if self._is_due and not self._frames and not self.host.transmit_pending():
+            self._is_due = False
+            used = len(self.host.flash_read(0x800, 0x800).rstrip(b"\xff")) + 7 >> 3
+            if used < 120:
+                self.host.flash_write(0x800 + 8 * used, bytes(8))
+            else:
+                record = self.host.flash_read(0, 16)
+                self.host.flash_erase(0)
+                self.host.flash_erase(0x800)
+                self.host.flash_write(0, record)
+        due_us = super().tick(now_us)
+        return now_us + 100 if self._is_due else due_us
+
+
 class ListensAfterItsBurst(PythonBootloader):
     """Is right: takes an update command only just after a burst, and makes a pause of 3 s
     between bursts without an application.

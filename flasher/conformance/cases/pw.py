@@ -371,8 +371,7 @@ def _cut_end(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
         while upgrade.new not in counts:
             _begin(bench, upgrade)
             version = _upgrade_until_cut(bench, upgrade, at_end=lambda: faults.fail(None))
-            calls = faults.calls
-            counts[upgrade.new] = calls[FlashCall.ERASE] + calls[FlashCall.WRITE]
+            counts[upgrade.new] = _operations(faults)
             _was_cut(bench, upgrade, version)
     for index in range(_OPERATIONS_MAX):
         for share in _SHARES:
@@ -506,13 +505,27 @@ def _cut_start(bench: Bench, upgrade: _InterruptedUpgrade) -> None:
     ):
         _cut_after(bench, upgrade, more, _SHARES[1], times=_CUTS_IN_A_ROW)
         more += 1
-    if upgrade.operations < _OPERATIONS_MAX and more < _OPERATIONS_MAX:
-        if upgrade.old != bench.good_image:  # else a device with two banks may go back to it
-            bench.check_upgrade()
-        _cut_rare_operations(bench, bench.good_image, upgrade.operations, more)
-    else:
+    before, faults = upgrade.operations, bench.subject.flash_faults
+    are_many = max(before, more) == _OPERATIONS_MAX
+    if are_many and faults is None:
         what = "power cuts in flash operations that only some upgrades have"
         bench.unsupported(what, f"an upgrade has more than {_OPERATIONS_MAX} flash operations")
+        return
+    if upgrade.old != bench.good_image:  # else a device with two banks may go back to it
+        bench.check_upgrade()
+    if are_many and faults is not None:
+        bench.reset_to_window()
+        faults.fail(None)
+        _upgrade_until_cut(bench, _InterruptedUpgrade(bench.good_image, bench.good_image))
+        before = _operations(faults)
+        bench.application_runs()
+        more = _operations(faults) - before
+    _cut_rare_operations(bench, bench.good_image, before, more)
+
+
+def _operations(faults: FlashFaults) -> int:
+    """Flash operations since `FlashFaults.fail`."""
+    return faults.calls[FlashCall.ERASE] + faults.calls[FlashCall.WRITE]
 
 
 def _cut_rare_operations(bench: Bench, image: bytes, before: int, more: int) -> None:
