@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 from uuid import UUID
 
+from pydantic import ValidationError
 from sqlalchemy import Connection, select
 
 from flasher.i18n import text
@@ -99,11 +100,31 @@ def differing(
         found = shown.get(run_id)
         if found is None or not is_whole(found):
             what = missing
-        elif compared(without_ids(found)) != compared(without_ids(contents[number])):
+        elif _is_changed(found, contents[number], compared):
             what = "what reports and pages show differs from what the station signed"
         else:
             continue
         yield Problem(text("run {run_id}", run_id=number), what)
+
+
+def _is_changed(
+    shown: Mapping[str, Any],
+    signed: Mapping[str, Any],
+    compared: Callable[[RunDetails], RunDetails],
+) -> bool:
+    if _shared(shown) != _shared(signed):
+        return True
+    try:
+        found = without_ids(shown)
+    except ValidationError:  # a value that no station writes
+        return True
+    return compared(found) != compared(without_ids(signed))
+
+
+def _shared(content: Mapping[str, Any]) -> list[Any]:
+    """Recipe and images as a whole: of a run, pages and filters show more than `RunDetails` has."""
+    rows = [content["recipe"], *content["artifacts"]]
+    return [each and {**each, "id": None} for each in rows]
 
 
 def _as_kept(details: RunDetails) -> RunDetails:

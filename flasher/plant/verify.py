@@ -146,8 +146,9 @@ class PlantExaminer(AssembledExaminer):
         """Examine a file of a retired month."""
         assert self._folder is not None  # noqa: S101  or none is examined
         with self._database.reading() as connection:
-            query = select(archive_file.c.sha256).where(archive_file.c.name == name)
-            stated = connection.execute(query).scalar_one_or_none()
+            file = archive_file.c
+            query = select(file.sha256, file.month).where(file.name == name)
+            stated = connection.execute(query).one_or_none()
         examiner = ArchiveExaminer(self._database, self._folder / name, chains, self._progress)
         try:
             found = examiner.examine_file()
@@ -155,8 +156,10 @@ class PlantExaminer(AssembledExaminer):
             yield Problem(printable(name), error.what)
             return
         yield from found.problems
-        if found.sha256 != stated:
+        if stated is None or found.sha256 != stated.sha256:
             yield Problem(printable(name), "it is not the file that was written: its hash differs")
+        elif found.manifest.month != stated.month:
+            yield Problem(printable(name), "the database states another month of it")
         self._runs += found.runs
         self._traces += found.traces
 

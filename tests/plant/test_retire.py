@@ -244,6 +244,15 @@ def test_what_follows_a_later_month_is_not_due_before_that_is(plant: Plant, send
     assert retired(plant, "2026-06") == []
 
 
+def test_a_month_that_begins_the_figures_earlier_is_found(three_months: Plant) -> None:
+    plant = three_months
+    (may,) = retired(plant, "2026-06")
+    with plant.connect() as owner:
+        owner.execute("UPDATE archive_file SET month = '2026-04'")
+    (problem,) = examined(plant, plant.folder / "archive").problems
+    assert (problem.where, problem.what) == (may.file, "the database states another month of it")
+
+
 class KilledError(BaseException):
     """The process is gone."""
 
