@@ -60,6 +60,7 @@ class Image:
         """Create an image from bytes, as from a raw binary file. Raises UsageError for a base that
         leaves no 32-bit addresses for them.
         """
+        data = bytes(memoryview(data))  # the caller may fill a bytearray again
         if base is not None and not 0 <= base <= ADDRESS_SPACE - len(data):
             raise UsageError(f"{source} is not inside 32-bit addresses with the base {base:#x}")
         return cls(

@@ -518,6 +518,13 @@ def test_a_file_has_so_many_lines_and_no_more(
         load(path)
 
 
+def test_an_image_keeps_its_bytes_when_their_buffer_is_filled_again() -> None:
+    buffer = bytearray(b"first")
+    image = Image.from_bytes(buffer)  # type: ignore[arg-type]
+    buffer[:] = b"other"
+    assert image.data == b"first"
+
+
 @pytest.mark.parametrize("base", [-1, 0xFFFF_FFF1, 1 << 32])
 def test_bytes_in_memory_have_32_bit_addresses(base: int) -> None:
     assert Image.from_bytes(bytes(16), base=0xFFFF_FFF0).base == 0xFFFF_FFF0
