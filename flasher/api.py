@@ -297,7 +297,8 @@ class Device:
     Every method takes the keywords of `CallOptions`. It raises BusError if the adapter fails or
     another tool sends on the bus, InterruptedByUserError if `cancelled` returned True, and
     UsageError while another call is running on the connection (in another thread, or around
-    `on_event`).
+    `on_event`). An upgrade opens a lost adapter again; after another call,
+    `connection.link.reopen()` does.
     """
 
     def __init__(
