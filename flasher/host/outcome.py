@@ -178,7 +178,13 @@ class Outcome:
             shorter = text("Choose a shorter --frame-gap (frame_gap_s in a profile).")
             error.remedy = text("{shorter} {remedy}", shorter=shorter, remedy=error.remedy)
         error.where = self.where
-        error.remedy = with_device_state(error.remedy, self.device_left)
+        if self.ending is Ending.SECOND_TOOL and self.device_left is DeviceLeft.UNTOUCHED:
+            error.remedy = text(
+                "{remedy} This run erased nothing; what the other tool has done is not known.",
+                remedy=error.remedy,
+            )
+        else:
+            error.remedy = with_device_state(error.remedy, self.device_left)
         error.needs_rescue = self.device_left.needs_rescue
         error.waiver = self.waiver or _WAIVERS.get(self.ending, "")
         return error
