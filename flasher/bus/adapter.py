@@ -122,7 +122,7 @@ def open_adapter(
                 link.channel = merged["channel"] = settings["channel"] = name
         except BusError:
             release()  # it may belong to the adapter that has the name now
-            place = ""
+            link.channel = place = ""
             raise
         # A symbolic link may lead to another serial port now.
         if (new_place := lock_name(merged)) != place:
@@ -199,7 +199,7 @@ class CanLink:
         self._chosen_by = [f"{key}={value}" for key, value in (chosen_by or {}).items()]
         self._interface = interface
         self.channel = channel
-        """Channel of the adapter; may be empty."""
+        """Channel of the adapter; may be empty, also while another adapter has its name."""
         self._open_again = open_again
         self.bit_rate: BitRate | None = None
         """Bit rate of the bus; None if unknown."""
@@ -368,7 +368,7 @@ class CanLink:
 
     def health(self) -> LinkHealth:
         """Return the health of adapter and bus without sending. Takes up to 2 s on SocketCAN."""
-        if self._interface == "socketcan":
+        if self._interface == "socketcan" and self.channel:
             state = read_interface(self.channel)
             if isinstance(state, Interface):
                 return self._health.health(state.state, state.tx_errors, state.rx_errors)

@@ -459,6 +459,7 @@ def test_a_lost_adapter_is_found_again_by_its_serial_number_and_never_by_its_nam
             link.reopen()
         assert caught.value.code is ErrorCode.ADAPTER_LOST
         assert len(seen) == 1
+        assert (link.channel, str(link)) == ("", "socketcan"), "the name is another adapter's"
     else:
         link.reopen()
         assert (seen[1]["channel"], link.channel, str(link)) == (

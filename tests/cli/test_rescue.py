@@ -126,6 +126,35 @@ def test_an_adapter_that_gets_its_first_name_back_is_named_by_it(
     assert flash.began.adapter == "virtual can2"
 
 
+def test_no_command_names_an_adapter_that_has_the_name_of_the_lost_one(
+    flasher: Flasher, stage: Stage, tmp_path: Path
+) -> None:
+    """The other one may be connected to another unit."""
+    stage.wrap = lambda link: TakenOver(link._bus, link._queue_frames)
+    stage.at_packet[2] = stage.bus.unplug
+    image = tmp_path / "new.bin"
+    image.write_bytes(IMAGE.data)
+    failed = flasher("flash", image, "-t", "bms", "-i", "virtual", "-c", "can2")
+    assert failed.code == ExitCode.BUS
+    repair = repair_named_in(failed.err)
+    assert repair[repair.index("-c") + 1] == "CHANNEL"
+    assert "can2" not in repair
+    (flash,) = FlashHistory().flashes()[0]
+    assert flash.began.adapter == "virtual"
+    assert "can2" not in flash.began.again
+
+
+class TakenOver(SimulatedLink):
+    channel = "can2"
+
+    def reopen(self) -> None:
+        self.channel = ""
+        super().reopen()
+
+    def __str__(self) -> str:
+        return "virtual"
+
+
 class Renamed(SimulatedLink):
     channel = ""
 

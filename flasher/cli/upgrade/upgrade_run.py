@@ -80,7 +80,7 @@ class UpgradeRun:
     """Start as the history has it."""
     _serial_number: str | None = None
     _result: Result | None = None
-    _connection: Connection = field(init=False)
+    _connection: Connection | None = None
     _saved: SavedSettings | None = None
 
     def write_planned(
@@ -183,15 +183,18 @@ class UpgradeRun:
         return result
 
     def _name_adapter(self) -> None:
-        """Give history and commands the name that the adapter came back with."""
-        connection = self._connection.renamed()
-        if connection is self._connection:
+        """Give history and commands the name that the adapter came back with; none while another
+        adapter has its name.
+        """
+        before = self._connection
+        if before is None or (connection := before.renamed()) is before:
             return
         self._connection = connection
-        self.output.progress(f"it is {printable(connection.name)} now")
+        if connection.channel:
+            self.output.progress(f"it is {printable(connection.name)} now")
         ctx = click.get_current_context(silent=True)
         if ctx is not None:  # there is none on the page
-            retype(ctx, "channel", connection.channel)
+            retype(ctx, "channel", connection.channel or "CHANNEL")
             retype(ctx, "interface", self.bus.interface or "")
         if self._start is not None:
             self._start = replace(
@@ -203,6 +206,7 @@ class UpgradeRun:
 
     def _failed(self, error: FlasherError) -> None:
         """Complete an error, with the command that restores the settings."""
+        self._name_adapter()
         self.on_failure(error)
         if self._saved is not None:
             error.remedy = text(
