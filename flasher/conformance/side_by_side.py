@@ -85,9 +85,10 @@ class SideBySide:
 
 def side_by_side(paths: Sequence[Path], reports: Sequence[RunReport]) -> SideBySide:
     """Arrange the reports, which were read from `paths`, in columns."""
+    are_different = len({path.name for path in paths}) == len(paths)
     columns = [
         RunColumn(
-            printable(path.name),
+            printable(path.name if are_different else str(path)),
             report.subject,
             report.ok,
             report.passes,

@@ -53,6 +53,16 @@ def test_what_differs_between_runs_is_shown_in_columns(
     assert "RS-01" in flasher("conformance", "compare", reports[0], reports[0], "-v").out
 
 
+def test_reports_of_one_name_are_named_by_their_folders(
+    flasher: Flasher, reports: list[Path], tmp_path: Path
+) -> None:
+    other = tmp_path / "b" / "right.json"
+    other.parent.mkdir()
+    other.write_bytes(reports[0].read_bytes())
+    document = flasher("conformance", "compare", reports[0], other, "--json").document
+    assert [run["name"] for run in document["runs"]] == [str(reports[0]), str(other)]
+
+
 @pytest.mark.slow
 def test_the_comparison_is_a_page_and_a_document_too(
     flasher: Flasher, reports: list[Path], tmp_path: Path
