@@ -39,7 +39,7 @@ from tests.plant.test_claims import Line, expire
 from tests.plant.test_retire import MONTH_S, retired
 from tests.plant.test_retire import examined as examined_with
 from tests.plant.test_verify import examined
-from tests.station.factory import FakeClock
+from tests.station.factory import USUAL, FakeClock
 
 pytestmark = pytest.mark.slow
 WHEN = datetime(2026, 5, 17, 12, tzinfo=UTC)
@@ -202,6 +202,20 @@ def test_a_run_that_ended_and_was_sent_without_its_end_is_interrupted(
     spare.send()
     assert not spare.bench.store.examine().problems
     assert not examined(plant).problems
+
+
+def test_a_golden_unit_passes_at_both_pcs(
+    plant: Plant, sender: Sender, key: bytes, spares: list[Sender]
+) -> None:
+    recipe = USUAL + '\n[golden]\nserial_numbers = ["W2600001"]\nevery_h = 8\n'
+    sender.bench.make()
+    sender.send()
+    taken(plant, key)
+    spares.append(spare := spare_of(plant, sender))
+    for each in (sender, spare):
+        each.bench.use(recipe)
+        each.bench.make(serial="W2600001")
+    assert brought(spare, sender.bench.path).conflicts == ()
 
 
 def test_a_unit_that_passes_at_both_pcs_is_named(

@@ -14,7 +14,7 @@ from datetime import datetime
 from itertools import zip_longest
 from typing import Any, Final
 
-from sqlalchemy import Connection, func, select, update
+from sqlalchemy import Connection, and_, func, select, update
 
 from flasher.errors import ErrorCode
 from flasher.protocol.text import printable
@@ -22,7 +22,7 @@ from flasher.station.records import chain, schema
 from flasher.station.records.database import Database
 from flasher.station.records.errors import NotFoundError, RecordError, UnprovenError
 from flasher.station.records.files import FileStore
-from flasher.station.records.model import AuditEvent, RunState, utc_text
+from flasher.station.records.model import AuditEvent, RunKind, RunState, utc_text
 from flasher.station.records.rows import find_or_insert, insert
 from flasher.station.records.store import Store
 
@@ -211,13 +211,15 @@ def _free_numbers(connection: Connection, contents: Mapping[int, Any]) -> dict[i
 
 def _passed_twice(connection: Connection, run_ids: Iterable[int]) -> tuple[str, ...]:
     run, unit = schema.run.c, schema.unit.c
-    passed = run.state == RunState.PASS.value
+    # As at two stations of a plant: others passed again because the recipe asked for it.
+    kinds = (RunKind.PRODUCTION.value, RunKind.RECHECK.value)
+    passed = and_(run.state == RunState.PASS.value, run.kind.in_(kinds))
     brought = select(run.unit_id).where(run.id.in_(list(run_ids)), passed)
     query = (
         select(unit.serial)
         .join_from(schema.run, schema.unit)
         .where(passed, run.unit_id.in_(brought))
-        .group_by(unit.serial)
+        .group_by(unit.id, unit.serial)
         .having(func.count() > 1)
         .order_by(unit.serial)
     )
