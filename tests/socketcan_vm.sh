@@ -70,7 +70,8 @@ fi
 if [ -n "$candlelight" ]; then
     export FLASHER_CANDLELIGHT=$folder/control
     mkfifo "$FLASHER_CANDLELIGHT"
-    "$candlelight" "$FLASHER_CANDLELIGHT" 2>"$folder/candlelight.log" &
+    # First of all processes: hardware does not wait for the CPU.
+    nice -n -20 "$candlelight" "$FLASHER_CANDLELIGHT" 2>"$folder/candlelight.log" &
 fi
 "$PYTHON" -m pytest -n 0 -m kernel -k "$only" -v -rsP --color=no --tb=short --durations=5 \
     -p no:cacheprovider -p tests.end_to_end.forks -p no:hypothesispytest -p no:anyio \
