@@ -140,7 +140,7 @@ def _become(arguments: tuple[str, ...], folder: Path, out: int, err: int) -> Non
         environment = clean_environment(NO_COLOR="1")
         os.environ.clear()
         os.environ.update(environment)
-        sys.argv = ["flasher", *arguments]
+        sys.argv = [sys.argv[0], *arguments]  # printed commands begin with `flasher`
         code = main(arguments)
         sys.stdout.flush()
         sys.stderr.flush()
