@@ -194,6 +194,7 @@ def test_a_check_is_waived_in_a_second_step_that_names_the_risk(page: Page) -> N
     page.set_input_files("#file", {"name": "odd.bin", "mimeType": "", "buffer": wrong})
     expect(page.locator("#refused-all")).to_contain_text("fit: 2")
     page.click("#refused-all")
+    page.click("text=Check again which images fit")  # the list is gone meanwhile
     page.click("#refused summary:text('Use it anyway')")
     # Its piece comes anew while it is read.
     page.evaluate(

@@ -4,6 +4,8 @@
 let isFocusLost = false;
 // Control that was used last: it gets the focus back as soon as it is shown again.
 let used = "";
+// Ids of <details> that were open when shown last: the list of files is gone while these are checked.
+const opened = new Map();
 
 // Name of the file to which a <details> element belongs, if any.
 function about(summary) {
@@ -13,8 +15,13 @@ function about(summary) {
 function apply(message) {
   const name = document.activeElement.id;
   isFocusLost ||= name !== "";
-  const opened = [...document.querySelectorAll("details[open] > summary[id]")]
-    .map((summary) => [summary.id, about(summary)]);
+  for (const summary of document.querySelectorAll("details > summary[id]")) {
+    if (summary.parentElement.open) {
+      opened.set(summary.id, about(summary));
+    } else {
+      opened.delete(summary.id);
+    }
+  }
   for (const [id, html] of Object.entries(message.parts ?? {})) {
     byId(id).innerHTML = html;
   }
@@ -23,6 +30,8 @@ function apply(message) {
     const summary = byId(id);
     if (summary && about(summary) === what) {
       summary.parentElement.setAttribute("open", "");
+    } else if (summary || what !== undefined) {
+      opened.delete(id);
     }
   }
   // Restore the keyboard focus, or move it to the next control as soon as there is one.
