@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import select
 import shutil
 import subprocess
 import sys
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -198,6 +200,26 @@ def test_a_call_that_does_not_return_is_ended_and_is_a_finding(
     report = _run(_FLAWS + "Hangs", "TX-06")
     found = _failures(report) + report.not_upgradable + report.stopped
     assert "did not return from flasher_dut_receive" in found
+
+
+def test_a_pause_of_this_computer_is_not_blamed_on_the_bootloader(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Whatever it takes, of a wait that it interrupts no more than one part is over."""
+
+    class PausedPoll:
+        def __init__(self) -> None:
+            self._poll = select.poll()
+            self.register, self.unregister = self._poll.register, self._poll.unregister
+            self._is_paused = False
+
+        def poll(self, timeout_ms: float) -> list[tuple[int, int]]:
+            self._is_paused = not self._is_paused
+            return [] if self._is_paused else self._poll.poll(timeout_ms)
+
+    real = SimpleNamespace(**{**vars(select), "poll": PausedPoll})
+    monkeypatch.setattr("flasher.conformance.dut.process.select", real)
+    assert _run(_HERE, "TX-06").ok
 
 
 @pytest.mark.slow

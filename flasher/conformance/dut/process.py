@@ -23,6 +23,8 @@ from flasher.errors import FlasherError, UsageError, printable
 
 WATCHDOG_S: Final = 5.0
 """A call that takes longer in real time counts as not returning."""
+_WATCHDOG_PARTS: Final = 10
+"""The time is waited in so many parts: a pause of this computer counts as one of them only."""
 _AFTER_HANG_S: Final = 0.5
 """The same once a call of this bootloader has not returned: most cases meet the same loop."""
 _SPAWNER_S: Final = 10.0
@@ -257,7 +259,8 @@ class BootloaderProcess:
 
     def _next(self, doing: str) -> tuple[PipeMessage, bytes]:
         while (found := self._pipe.take()) is None:
-            if not self._poll.poll(self._watchdog_s * 1000):
+            part_ms = self._watchdog_s * 1000 / _WATCHDOG_PARTS
+            if not any(self._poll.poll(part_ms) for _ in range(_WATCHDOG_PARTS)):
                 self.kill()
                 limit_s, self._watchdog_s = self._watchdog_s, min(WATCHDOG_S, _AFTER_HANG_S)
                 raise BootloaderError(
