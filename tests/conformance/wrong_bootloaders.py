@@ -134,7 +134,7 @@ class CompactsAfterComplete(WritesALog):
         if self._is_due and not self._frames and not self.host.transmit_pending():
             self._is_due = False
             used = len(self.host.flash_read(0x800, 0x800).rstrip(b"\xff")) + 7 >> 3
-            if used < 120:
+            if used < 24:
                 self.host.flash_write(0x800 + 8 * used, bytes(8))
             else:
                 record = self.host.flash_read(0, 16)
