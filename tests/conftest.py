@@ -167,5 +167,5 @@ def postgres() -> Iterator[Server]:
     programs = find_programs()
     if programs is None:
         pytest.skip("PostgreSQL is not installed (Debian: apt-get install postgresql)")
-    with running_server(programs) as server:
+    with running_server(programs, in_memory=True) as server:
         yield server

@@ -12,9 +12,11 @@ from tests.station.postgres import Server
 
 
 @pytest.fixture
-def plant(postgres: Server, tmp_path: Path) -> Plant:
+def plant(postgres: Server, tmp_path: Path) -> Iterator[Plant]:
     """A plant's database for the stations line-2 and line-3, with nothing in it."""
-    return Plant(postgres, tmp_path)
+    made = Plant(postgres, tmp_path)
+    yield made
+    made.drop()
 
 
 @pytest.fixture

@@ -71,6 +71,12 @@ class Plant:
             given = f"GRANT CONNECT ON DATABASE {self.database} TO flasher_stations, {READERS}"
             admin.execute(given.encode())
 
+    def drop(self) -> None:
+        """Delete the database: hundreds of them take long at the end, and gigabytes until then."""
+        with self.server.connect() as admin:
+            admin.autocommit = True
+            admin.execute(f"DROP DATABASE {self.database} WITH (FORCE)".encode())
+
     def url(self, role: str = OWNER) -> str:
         secret = "" if role == OWNER else f":{PASSWORD}"
         return f"postgresql://{role}{secret}@127.0.0.1:{self.server.port}/{self.database}"

@@ -70,6 +70,7 @@ def desk(postgres: Server, tmp_path: Path, delivering: str) -> Iterator[Desk]:
     plant = Plant(postgres, tmp_path, delivering)
     with closing(Central(plant.url(COURIER))) as central:
         yield Desk(plant, central)
+    plant.drop()
 
 
 def test_a_filter_chooses_by_each_of_its_fields(desk: Desk) -> None:

@@ -71,8 +71,10 @@ def without_may(
 
 
 @pytest.fixture
-def three_months(postgres: Server, tmp_path: Path, sent_months: str) -> Plant:
-    return Plant(postgres, tmp_path, sent_months)
+def three_months(postgres: Server, tmp_path: Path, sent_months: str) -> Iterator[Plant]:
+    made = Plant(postgres, tmp_path, sent_months)
+    yield made
+    made.drop()
 
 
 @contextmanager

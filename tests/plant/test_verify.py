@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -42,9 +43,11 @@ def sent(postgres: Server, tmp_path_factory: pytest.TempPathFactory) -> Plant:
 
 
 @pytest.fixture
-def two(sent: Plant, postgres: Server, tmp_path: Path) -> Plant:
+def two(sent: Plant, postgres: Server, tmp_path: Path) -> Iterator[Plant]:
     """A copy of it."""
-    return Plant(postgres, tmp_path, sent.database)
+    made = Plant(postgres, tmp_path, sent.database)
+    yield made
+    made.drop()
 
 
 def test_what_the_stations_sent_is_as_they_signed_it(two: Plant) -> None:

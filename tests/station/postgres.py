@@ -15,6 +15,7 @@ from pathlib import Path
 import psycopg
 
 OWNER = "postgres"
+_MEMORY = Path("/dev/shm")  # noqa: S108  only a unique folder in it is used
 _INSTALLED = Path("/usr/lib/postgresql")
 _RULES = f"""\
 host all {OWNER} 127.0.0.1/32 trust
@@ -91,13 +92,24 @@ def find_programs() -> Path | None:
     return newest and newest.parent
 
 
+def _has_room(place: Path) -> bool:
+    return place.is_dir() and shutil.disk_usage(place).free > 1 << 30
+
+
 @contextmanager
 def running_server(
-    programs: Path, kept: Path | None = None, *, is_durable: bool = False
+    programs: Path,
+    kept: Path | None = None,
+    *,
+    is_durable: bool = False,
+    in_memory: bool = False,
 ) -> Iterator[Server]:
-    """A server from start to end; with a folder that is `kept`, its databases are there again."""
+    """A server from start to end; with a folder that is `kept`, its databases are there again.
+    With `in_memory` they are small, and no disk that is busy holds them up.
+    """
     # A short path, since the server's socket lies in it.
-    folder = kept or Path(tempfile.mkdtemp(prefix="flasher-pg-"))
+    place = _MEMORY if in_memory and _has_room(_MEMORY) else None
+    folder = kept or Path(tempfile.mkdtemp(prefix="flasher-pg-", dir=place))
     try:
         if os.geteuid() == 0:
             shutil.chown(folder, OWNER)
