@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import closing
 
+import psycopg
 import pytest
 
 from flasher.plant.central import Central
@@ -61,6 +62,28 @@ def test_a_server_that_hangs_is_given_up_and_used_again_when_it_works(
     assert "sent nothing for 0.4 s" in caught.value.cause
     with central.writing() as connection:
         connection.exec_driver_sql("SELECT 1")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        psycopg.errors.LockNotAvailable("canceling statement due to lock timeout"),
+        psycopg.errors.PipelineAborted("pipeline aborted"),
+    ],
+)
+def test_an_error_while_a_statement_of_a_pipeline_is_active_is_no_silence(
+    plant: Plant, error: psycopg.Error
+) -> None:
+    def receiving() -> Iterator[None]:
+        yield from ()
+        raise error
+
+    with closing(server._Connection.connect(plant.url(OWNER))) as connection:
+        connection.pgconn.send_query(b"SELECT pg_sleep(0.01)")
+        with pytest.raises(psycopg.Error) as caught:
+            connection.wait(receiving())
+        assert caught.value is error
+        assert not connection.closed
 
 
 def test_a_server_that_is_not_there_or_sends_nothing_is_an_error() -> None:

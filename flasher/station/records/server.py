@@ -6,6 +6,7 @@ Needs the extra `plant`; imported only when a server is configured.
 from __future__ import annotations
 
 import math
+import time
 from enum import IntEnum
 from typing import Any, Final
 
@@ -49,10 +50,14 @@ class _Connection(psycopg.Connection[Any]):
 
     def wait(self, gen: Any, interval: float = 0.1, timeout: float | None = None) -> Any:
         limit_s = self.silence_limit_s if timeout is None else timeout
+        began = time.perf_counter()
         try:
             return super().wait(gen, interval, limit_s)
-        except psycopg.OperationalError:
-            if self.pgconn.transaction_status != TransactionStatus.ACTIVE:
+        except psycopg.OperationalError as error:
+            # In a pipeline, an error of the server, too, comes while a statement is active.
+            is_active = self.pgconn.transaction_status == TransactionStatus.ACTIVE
+            waited_s = time.perf_counter() - began  # psycopg takes a coarser clock
+            if error.sqlstate is not None or not is_active or waited_s < 0.9 * limit_s:
                 raise
             self.pgconn.finish()  # the state of the connection is unknown
             raise psycopg.OperationalError(f"the server sent nothing for {limit_s:g} s") from None
