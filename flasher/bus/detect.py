@@ -80,8 +80,9 @@ class DetectedAdapter:
         """Serial number, or USB path without one, and index of the channel in the adapter; what it
         keeps when it is plugged in again under another name. Empty if not reported.
         """
-        mark = self.serial_number or self.usb_path
-        return (mark, str(self.details.get(_INDEX, ""))) if mark else ("", "")
+        usb_path, index = self.place
+        mark = self.serial_number or usb_path
+        return (mark, index) if mark else ("", "")
 
     @property
     def place(self) -> tuple[str, str]:

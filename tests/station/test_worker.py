@@ -338,15 +338,10 @@ def test_an_adapter_that_cannot_be_opened_is_reported_once_and_tried_again(tmp_p
     )
 
 
-def test_an_adapter_that_has_another_name_now_is_still_the_sockets(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its process was started again, or did not find it at first."""
-    socket = RealAdapter(tmp_path)
-    setup = replace(
-        socket.setup, adapter=SocketConfig(name="A", interface="socketcan", serial_number="7")
-    )
-    found: list[DetectedAdapter] = []
+def opened_by(
+    socket: RealAdapter, found: list[DetectedAdapter], monkeypatch: pytest.MonkeyPatch
+) -> list[dict[str, Any]]:
+    """Have these adapters found. Returns a list that gets how each is opened."""
     opened: list[dict[str, Any]] = []
 
     @contextmanager
@@ -356,6 +351,19 @@ def test_an_adapter_that_has_another_name_now_is_still_the_sockets(
 
     monkeypatch.setattr("flasher.station.worker.connect", connect)
     monkeypatch.setattr("flasher.station.adapters.network_adapters", lambda _network: found)
+    return opened
+
+
+def test_an_adapter_that_has_another_name_now_is_still_the_sockets(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its process was started again, or did not find it at first."""
+    socket = RealAdapter(tmp_path)
+    setup = replace(
+        socket.setup, adapter=SocketConfig(name="A", interface="socketcan", serial_number="7")
+    )
+    found: list[DetectedAdapter] = []
+    opened = opened_by(socket, found, monkeypatch)
     with (
         pytest.raises(BusError, match="no socketcan adapter with the serial number 7"),
         open_socket(setup, socket.recipe),
@@ -375,15 +383,7 @@ def test_the_adapter_of_a_socket_that_names_a_place_is_opened_again_by_its_place
     socket = RealAdapter(tmp_path)
     place = SocketConfig(name="A", interface="socketcan", usb_path="1-1")
     found = [DetectedAdapter("socketcan", "can2", {"serial_number": "7", "usb_path": "1-1"})]
-    opened: list[dict[str, Any]] = []
-
-    @contextmanager
-    def connect(_dialect: object, **bus: Any) -> Iterator[Connection]:
-        opened.append(bus)
-        yield socket.connection()
-
-    monkeypatch.setattr("flasher.station.worker.connect", connect)
-    monkeypatch.setattr("flasher.station.adapters.network_adapters", lambda _network: found)
+    opened = opened_by(socket, found, monkeypatch)
     with open_socket(replace(socket.setup, adapter=place), socket.recipe):
         pass
     assert [(bus["channel"], bus["by_place"]) for bus in opened] == [("can2", True)]
