@@ -165,7 +165,8 @@ def check_bench(options: BenchOptions) -> None:
         raise UsageError(
             "A good image is required.",
             cause="the suite erases the device many times and has to restore it",
-            remedy="Give an image that is known to run on the device, or use the mock.",
+            remedy="Give an image that is known to run on the device (--good-image), or use the "
+            "mock (--mock).",
         )
 
 
